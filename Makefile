@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-rust test-server test-computed test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -32,7 +32,6 @@ help:
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run also builds it)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-long       every test of Rust in its long form; docs/tests.md lists the differences'
-	@echo 'make test-rust       every test of Rust'
 	@echo 'make test-protocol   is proto/generated that of the protocol?'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
@@ -157,19 +156,10 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 
 # The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
 # and `make stress` many.
-test: build $(VENV)/ready test-viewer test-python test-rust test-protocol
+test: build $(VENV)/ready test-viewer test-python test-protocol
+	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast
 	sh tests/abi/check.sh $(BUILT) interface
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
-
-# The tests of running servers mostly wait, so the others run beside them.
-CARGO_TEST := PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --no-fail-fast
-test-rust: build
-	$(CARGO) test --release --workspace --no-run
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-server test-computed
-test-server:
-	$(CARGO_TEST) --workspace --test server --test siege
-test-computed:
-	$(CARGO_TEST) --workspace --exclude palpate-server-tests
 
 test-long: build
 	PALPATE_LONG=1 PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast -- --include-ignored \

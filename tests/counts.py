@@ -26,10 +26,10 @@ TYPE = re.compile(r"^[ \t]*(pub(?:\([^)]*\))?[ \t]+)?(?:struct|enum|union|trait|
 CONSTANT = re.compile(r"\b(?:PATIENCE(?:_\w+)?|MOST_\w+|LEAST_\w+|OFF_SHEET)\b")
 MAX_WORDS = 40
 GENERATED = "proto/generated/"
-MAX_KINDS = 71
+MAX_KINDS = 33
 ASKS = re.compile(
     r"\bBody::(Sheet|Mesh)\b|\bElastic::(Sheet|Mesh)\b|\b(FootprintGeometry|SavedGeometry)::(Grid|Mesh)\b"
-    r"|\.dimensions\(\)\s*[=!<>]|\.sheet(_mut)?\(\)|\bgraph\.(as_ref|as_deref|is_none|is_some|iter|clone)\(\)|&(self|model|self\.model)\.graph\b"
+    r"|\b(Places|TileGraph)::(Sheet|Surface)\b|\.dimensions\(\)\s*[=!<>]|\.sheet(_mut)?\(\)|\bplaces\.surface\(\)"
 )
 AT_HOME = ("crates/tissue/src/body/", "crates/tissue/src/scene/mod.rs", "crates/tissue/src/scene/sheet.rs",
            "crates/tissue/src/scene/mesh.rs", "crates/session/src/wire/scene.rs")

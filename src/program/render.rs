@@ -84,9 +84,7 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
         ));
     }
     let camera = arguments.camera.parse()?;
-    let cells = (model.shape().longest_side_m() / model.shape().edge_m()).round().max(1.0) as u32;
-    let fine =
-        if arguments.wireframe || model.scene.sheet().is_none() { 0 } else { 300_u32.div_ceil(cells).clamp(1, 11) - 1 };
+    let fine = if arguments.wireframe { 0 } else { Refinement::for_picture(&model.scene) };
     let refinement = Refinement::new(&model.scene, arguments.refine.unwrap_or(fine), &limits)?;
     let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
     let view = View { camera, size, refinement, texture: skin };

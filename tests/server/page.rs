@@ -5,7 +5,7 @@ use std::net::TcpStream;
 use std::path::Path;
 
 use crate::common::cores;
-use crate::common::server::{TEST_TIMEOUT, TestServer, told};
+use crate::common::server::{TEST_TIMEOUT, TestServer, repository, told};
 use palpate::server::identity::{self, Role};
 use palpate_proto::pb;
 use palpate_session::wire;
@@ -213,7 +213,7 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
     let listed = sessions.list_scripts(pb::ListScriptsRequest::default()).await.unwrap().into_inner().script_names;
     assert_eq!(listed, ["grasp", "oblique-100", "oblique-60", "press", "push", "stroke", "vertical-60"]);
     let limits = Limits::default();
-    let scene = Scene::load(Path::new("scenes/paper.toml"), &[], &limits).unwrap();
+    let scene = Scene::load(&repository().join("scenes/paper.toml"), &[], &limits).unwrap();
     for script_name in listed {
         let script = find_script(Path::new(&script_name), &scene, &limits).unwrap();
         let request = pb::GetScriptRequest { session_id: session_id.clone(), script_name };

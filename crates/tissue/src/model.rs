@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use crate::body::MemoryLayout;
-use crate::body::surface::{GraphFault, MeshPlaces};
+use crate::body::Places;
+use crate::body::surface::GraphFault;
 use crate::kernel::field::{BLOCK, Layout};
 use crate::scene::{Integrator, Lanes, Precision, Scene};
 use crate::scheme::stability;
@@ -26,7 +27,7 @@ pub struct Model {
     /// The unit of length: the distance between neighbours, m.
     pub(super) unit_m: f64,
     /// The places in memory of a mesh's points, and its springs; `None` for a sheet.
-    pub(super) graph: Option<Arc<MeshPlaces>>,
+    pub(super) places: Places,
     /// ω_b = √((λ + K″)/m), rad/s, for a point of the reference mass m; λ is the largest eigenvalue of the
     /// springs' stiffness, K″ that of an anchor spring ([`Oscillator::omega_bound_per_s`]). No vibration is
     /// faster, under any deformation.
@@ -126,11 +127,11 @@ impl Model {
     /// # Errors
     /// Returns the fault of a mesh whose springs can't be laid out.
     pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
-        let MemoryLayout { points, fixed, graph } = MemoryLayout::of(&scene)?;
+        let MemoryLayout { points, fixed, places } = MemoryLayout::of(&scene)?;
         Ok(Model {
             points,
             fixed,
-            graph,
+            places,
             unit_m: scene.shape().edge_m(),
             omega_bound_per_s: Oscillator::of(&scene).omega_bound_per_s(),
             plan,
@@ -198,13 +199,18 @@ impl Model {
     }
 
     /// Returns the number of places in memory; some places of a mesh are empty.
-    pub(super) fn places(&self) -> usize {
+    pub(super) fn place_count(&self) -> usize {
         self.points[0] * self.points[1]
+    }
+
+    /// Returns the number of rows of a sheet over which a spring reaches.
+    pub(super) fn spring_rows(&self) -> usize {
+        if self.scene.springs.bending { 2 } else { 1 }
     }
 
     /// Returns the row-major place of a point in memory.
     pub(super) fn place_of(&self, point: PointId) -> usize {
-        self.graph.as_ref().map_or(point.index(), |graph| graph.slot_of(point))
+        self.places.place_of(point)
     }
 
     /// Returns the order in which frames show a mesh, as two lists: the vertex at each position of a frame (in
@@ -212,14 +218,12 @@ impl Model {
     /// inverse of the other, over [`Model::len`] vertices. `None` for a sheet, which frames show in the order
     /// of its points.
     pub fn shown_order(&self) -> Option<[&[u32]; 2]> {
-        let slots = &self.graph.as_ref()?.slots;
-        // Empty places are at the end.
-        Some([&slots.vertex_of()[..self.len()], slots.slot_of()])
+        self.places.order(self.len())
     }
 
     /// Returns the point at a place in memory; for an empty place, any point.
     pub(super) fn point_at(&self, index: usize) -> PointId {
-        self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
+        self.places.point_at(index)
     }
 
     /// Returns the mass of a point, kg: the reference mass [`Scene::point_mass_kg`] times
@@ -243,12 +247,12 @@ impl Model {
     /// Returns the mass at a place in memory divided by the reference mass. It divides a force there in the
     /// scheme's units ([`Plan::force_scale`]), and multiplies C.
     pub(super) fn relative_mass_at(&self, index: usize) -> f64 {
-        self.graph.as_ref().map_or(1.0, |graph| graph.slots.mass(index))
+        self.places.relative_mass(index)
     }
 
     /// Returns K″/m at a place in memory divided by the reference value, minus 1.
     pub(super) fn extra_anchor_at(&self, index: usize) -> f64 {
-        self.graph.as_ref().map_or(0.0, |graph| graph.slots.extra_at(index))
+        self.places.extra_anchor(index)
     }
 
     /// Returns K″ at a place in memory divided by the reference value.

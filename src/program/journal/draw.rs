@@ -98,10 +98,7 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let begin = if moves { *from } else { Some(at.map_or_else(|| strongest(source), Ok)?) };
     let mut replay = source.replay(begin)?;
     let (model, limits) = (replay.session().model().clone(), source.limits()?);
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let cells = (model.shape().longest_side_m() / model.shape().edge_m()).round().max(1.0) as u32;
-    let fine =
-        if arguments.wireframe || model.scene.sheet().is_none() { 0 } else { 300_u32.div_ceil(cells).clamp(1, 11) - 1 };
+    let fine = if arguments.wireframe { 0 } else { Refinement::for_picture(&model.scene) };
     let refinement = Refinement::new(&model.scene, fine, &limits)?;
     let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
     let view = View { camera: arguments.camera.parse()?, size, refinement, texture: skin };

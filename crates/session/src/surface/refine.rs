@@ -18,6 +18,9 @@ const ROW: &str = "a row of a frame";
 /// Largest refinement n: the number of vertices between two neighbouring points of a sheet.
 pub const LARGEST_REFINEMENT: u32 = 10;
 
+/// Vertices along the longest side of a picture: enough that no edge is seen in it.
+const PICTURE_VERTICES: u32 = 300;
+
 /// Number of places for a mesh's vertices in a row of a frame. 16 rows are a tile of the frame, and a tile of the
 /// sleeping logic.
 pub const MESH_ROW: usize = 16;
@@ -49,6 +52,17 @@ pub struct Refinement {
 }
 
 impl Refinement {
+    /// Returns the number of points between neighbouring ones that makes a picture smooth: some 300 vertices along its
+    /// longest side. 0 where frames show the points alone.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn for_picture(scene: &Scene) -> u32 {
+        if !scene.body.kind().can_refine() {
+            return 0;
+        }
+        let cells = (scene.shape().longest_side_m() / scene.shape().edge_m()).round().max(1.0) as u32;
+        PICTURE_VERTICES.div_ceil(cells).clamp(1, LARGEST_REFINEMENT + 1) - 1
+    }
+
     /// Creates refinement `n` of the tissue of a scene.
     ///
     /// # Errors
@@ -59,7 +73,7 @@ impl Refinement {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }
-        if n > 0 && scene.sheet().is_none() {
+        if n > 0 && !scene.body.kind().can_refine() {
             let message = format!("must be 0 on a mesh, whose own vertices are shown, but is {n}");
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }

@@ -239,7 +239,7 @@ impl Footprint {
 
     /// Takes over the vertices that the disc covers on a mesh.
     fn lay(&mut self, model: &Model) {
-        let (FootprintGeometry::Mesh(disc), Some(graph)) = (&mut self.ground, &model.graph) else { return };
+        let (FootprintGeometry::Mesh(disc), Some(graph)) = (&mut self.ground, model.places.surface()) else { return };
         self.reached.clear();
         (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
         for (vertex, weight, gradient, at_m) in disc.cover() {
@@ -431,7 +431,7 @@ mod tests {
             (Model::gallbladder(&[]), DVec3::new(0.02, 0.0, -0.05), 0.006),
         ] {
             let footprint = Footprint::new(&model, radius_m, at_m);
-            let mut weights = vec![0.0; model.places()];
+            let mut weights = vec![0.0; model.place_count()];
             for reached in footprint.reached() {
                 weights[model.index_of(reached.point)] = reached.weight;
             }

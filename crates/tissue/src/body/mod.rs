@@ -5,13 +5,21 @@ pub(crate) mod footprint;
 pub(crate) mod sheet;
 pub mod surface;
 pub(crate) mod tables;
+pub(crate) mod tile_graph;
 
+use std::ops::Range;
 use std::sync::Arc;
 
-use crate::kernel::field::BLOCK;
-use crate::scene::{Body, Scene};
-use crate::shape::{self, RestShape};
-use surface::{GraphFault, MeshPlaces};
+use glam::DVec3;
+
+use crate::kernel::field::{BLOCK, Field, Layout};
+use crate::kernel::lanes::Width;
+use crate::kernel::real::Real;
+use crate::scene::profile::Poke;
+use crate::scene::{Body, Scene, Sheet};
+use crate::shape::{self, PointId, RestShape};
+use sheet::falloff::SheetPoints;
+use surface::{GraphFault, MeshPlaces, VolumePlaces};
 
 /// The points of a scene in memory.
 pub(crate) struct MemoryLayout {
@@ -19,8 +27,16 @@ pub(crate) struct MemoryLayout {
     pub(crate) points: [usize; 2],
     /// Row-major places of the fixed points, ascending.
     pub(crate) fixed: Vec<usize>,
-    /// The places of a mesh's points, and its springs; `None` for a sheet.
-    pub(crate) graph: Option<Arc<MeshPlaces>>,
+    pub(crate) places: Places,
+}
+
+/// Where each point of a tissue is in memory, and how it differs from the others. A place is a row-major index.
+#[derive(Debug, Clone)]
+pub(crate) enum Places {
+    /// The points of a sheet are in memory in their order, and alike.
+    Sheet(SheetPoints),
+    /// The points of a mesh, and its springs.
+    Surface(Arc<MeshPlaces>),
 }
 
 impl MemoryLayout {
@@ -30,23 +46,129 @@ impl MemoryLayout {
     /// Returns the fault of a mesh whose springs can't be laid out.
     pub(crate) fn of(scene: &Scene) -> Result<Self, GraphFault> {
         Ok(match &scene.body {
-            Body::Sheet(sheet) => MemoryLayout { points: sheet.points, fixed: sheet.fixed_indices(), graph: None },
+            Body::Sheet(sheet) => {
+                let Sheet { points, spacing_m, .. } = *sheet;
+                let places = Places::Sheet(SheetPoints { points, spacing_m });
+                MemoryLayout { points, fixed: sheet.fixed_indices(), places }
+            }
             Body::Mesh(mesh) => {
-                let graph = MeshPlaces::of(mesh)?;
+                let places = MeshPlaces::of(mesh)?;
                 let points = shape::points(&*mesh.shape).filter(|point| mesh.shape.is_fixed(*point));
-                let mut fixed: Vec<usize> = points.map(|point| graph.slot_of(point)).collect();
+                let mut fixed: Vec<usize> = points.map(|point| places.slot_of(point)).collect();
                 fixed.sort_unstable();
-                MemoryLayout { points: [graph.rows(), BLOCK], fixed, graph: Some(Arc::new(graph)) }
+                MemoryLayout { points: [places.rows(), BLOCK], fixed, places: Places::Surface(Arc::new(places)) }
             }
         })
     }
 }
 
-/// Adds what tells the tissue of `scene` from another with the same coefficients to the bytes of its identity: its
-/// kind, and on a mesh also points, order in memory and springs.
-pub(crate) fn identify(scene: &Scene, graph: Option<&MeshPlaces>, add: &mut impl FnMut(&[u8])) {
-    match (&scene.body, graph) {
-        (Body::Mesh(mesh), Some(graph)) => surface::identify(mesh, graph, add),
-        _ => add(b"sheet"),
+impl Places {
+    /// Returns what a mesh has, if the tissue is one.
+    fn surface(&self) -> Option<&MeshPlaces> {
+        match self {
+            Places::Sheet(_) => None,
+            Places::Surface(places) => Some(places),
+        }
+    }
+
+    /// Returns the place of a point.
+    pub(crate) fn place_of(&self, point: PointId) -> usize {
+        self.surface().map_or(point.index(), |places| places.slot_of(point))
+    }
+
+    /// Returns the point at a place; for an empty place, any point.
+    pub(crate) fn point_at(&self, place: usize) -> PointId {
+        self.surface().map_or(PointId::new(place), |places| places.point_in(place))
+    }
+
+    /// Returns the point at each place and the place of each of `points` points; `None` if their order is that of the
+    /// points.
+    pub(crate) fn order(&self, points: usize) -> Option<[&[u32]; 2]> {
+        let slots = &self.surface()?.slots;
+        // Empty places are at the end.
+        Some([&slots.vertex_of()[..points], slots.slot_of()])
+    }
+
+    /// Returns whether points may differ in mass and anchor stiffness.
+    pub(crate) fn differ(&self) -> bool {
+        self.surface().is_some()
+    }
+
+    /// Returns the mass at a place divided by the reference mass.
+    pub(crate) fn relative_mass(&self, place: usize) -> f64 {
+        self.surface().map_or(1.0, |places| places.slots.mass(place))
+    }
+
+    /// Returns the largest relative mass.
+    pub(crate) fn largest_mass(&self) -> f64 {
+        self.surface().map_or(1.0, |places| places.largest_mass)
+    }
+
+    /// Returns K″/m at a place divided by the reference value, minus 1.
+    pub(crate) fn extra_anchor(&self, place: usize) -> f64 {
+        self.surface().map_or(0.0, |places| places.slots.extra_at(place))
+    }
+
+    /// Returns the smallest K″/m divided by the reference value, minus 1; at most 0.
+    pub(crate) fn least_extra_anchor(&self) -> f64 {
+        self.surface().map_or(0.0, |places| places.least_extra)
+    }
+
+    /// Returns the springs of a mesh at a place: the place of the other end, the vector to it at rest in units of length,
+    /// and k divided by the reference k. A sheet has none of its own: its springs are the same everywhere.
+    pub(crate) fn joined(&self, place: usize) -> impl Iterator<Item = (usize, DVec3, f64)> + '_ {
+        self.surface().into_iter().flat_map(move |places| places.joined(place))
+    }
+
+    /// Returns the enclosed volume by places, if it resists changes.
+    pub(crate) fn volume(&self) -> Option<&VolumePlaces> {
+        self.surface()?.volume.as_ref()
+    }
+
+    /// Returns the first and the end of the rows and of the columns of points that a force reaches. Beyond them its
+    /// factor is 0 in the format `T`.
+    pub(crate) fn reached<T: Real>(&self, poke: &Poke) -> [[usize; 2]; 2] {
+        let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
+        match self {
+            Places::Sheet(points) => points.reached(poke.centre_m, reach_m),
+            Places::Surface(places) => {
+                let rows = places.rows_within(poke.centre_m, reach_m);
+                [[rows.start, rows.end], [0, if rows.is_empty() { 0 } else { BLOCK }]]
+            }
+        }
+    }
+
+    /// Writes the falloff of `poke`, e^(−c·r) divided by the relative mass, over some rows and columns, with whole rows
+    /// in `factors`, and which part of each row is not 0.
+    pub(crate) fn fall_off<T: Real>(
+        &self,
+        width: Width,
+        poke: &Poke,
+        layout: &Layout,
+        [rows, columns]: [Range<usize>; 2],
+        factors: &mut Field<T>,
+        spans: &mut Vec<Range<usize>>,
+    ) {
+        match self {
+            Places::Sheet(points) => points.fall_off(width, poke, layout, [rows, columns], factors, spans),
+            Places::Surface(places) => places.fall_off(poke, layout, rows, factors, spans),
+        }
+    }
+
+    /// Returns the distance at rest of the point at a place from a control point, m.
+    pub(crate) fn away_m(&self, place: usize, centre_m: DVec3) -> f64 {
+        match self {
+            Places::Sheet(points) => points.away_m(place, centre_m),
+            Places::Surface(places) => places.rest_m(place).distance(centre_m),
+        }
+    }
+
+    /// Adds what tells the tissue of `scene` from another with the same coefficients to the bytes of its identity: its
+    /// kind, and on a mesh also points, order in memory and springs.
+    pub(crate) fn identify(&self, scene: &Scene, add: &mut impl FnMut(&[u8])) {
+        match (&scene.body, self) {
+            (Body::Mesh(mesh), Places::Surface(places)) => surface::identify(mesh, places, add),
+            _ => add(b"sheet"),
+        }
     }
 }

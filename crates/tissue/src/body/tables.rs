@@ -4,6 +4,7 @@
 use std::cell::RefCell;
 use std::sync::Arc;
 
+use crate::body::Places;
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
 use crate::body::surface::pressure::{Pressure, push_of};
@@ -14,7 +15,7 @@ use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::springs::{SpringCoefficients, Springs};
 use crate::kernel::stage::Stage;
-use crate::model::Model;
+use crate::model::{Model, Plan};
 use crate::scheme::advance::AdvanceStage;
 use crate::scheme::arithmetic::{Arithmetic, MAX_KEPT};
 use crate::tools::applied_force::{self, Pull, Term};
@@ -45,6 +46,20 @@ impl<T: Real> Elastic<T> {
                 surface::gather(&places.slots, unit, *pull, pressed, u, slot)
             }
         }
+    }
+}
+
+/// Returns the springs of a model in the units of a plan.
+pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
+    let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
+    match &model.places {
+        Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
+        Places::Surface(places) => Elastic::Mesh(
+            places.clone(),
+            SpringCoefficients::new(unit * model.scene.springs.stiffness_n_per_m, 1.0),
+            T::of(unit * model.scene.anchor_stiffness_n_per_m),
+            places.volume.as_ref().map_or(0.0, |volume| unit * model.scene.volume_stiffness_pa * volume.stretch_m),
+        ),
     }
 }
 
@@ -82,16 +97,16 @@ impl<T: Real> SweepTables<T> {
             free
         });
         let zero = [T::default(); BLOCK];
-        let carry = if model.graph.is_some() { Field::of_length(0) } else { Field::zero(&layout) };
+        let carry = if model.places.surface().is_some() { Field::of_length(0) } else { Field::zero(&layout) };
         SweepTables {
             width: Width::of(model.lanes),
             layout,
             springs,
-            mesh: model.graph.as_ref().map(|graph| MeshTables {
+            mesh: model.places.surface().map(|graph| MeshTables {
                 springs: MeshSprings::new(&graph.slots, lanes::shape::<T>(Width::of(model.lanes))),
                 snapshot: RefCell::new(Snapshot::of(&graph.slots)),
             }),
-            pressure: model.graph.as_ref().and_then(|graph| Pressure::new(graph, &layout)),
+            pressure: model.places.surface().and_then(|graph| Pressure::new(graph, &layout)),
             free,
             carry: RefCell::new(carry),
             probe: zero,

@@ -20,13 +20,14 @@ use std::sync::Arc;
 use super::interface::BlowUp;
 use super::model::{Model, Plan};
 use crate::body::tables::Elastic;
+use crate::body::tables::springs_of;
 pub use crate::guard::checkpoint::{CheckFailure, MARGIN};
 use crate::guard::checkpoint::{Checkpoint, Input, Noise, Repetition, Work};
 use crate::guard::survey::Survey;
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
 use crate::memory;
-use crate::state::tissue_state::{TissueState, springs_of};
+use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 
 /// Number of substeps between two surveys, in which the guard checks the whole tissue and takes a checkpoint. A
@@ -236,7 +237,7 @@ pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
 pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &State<T>) -> Option<usize> {
     let farthest = T::of(farthest_in_spacings(model));
     let is_good = |field: &Field<T>, at: usize| field[at].is_finite() && field[at].magnitude() < farthest;
-    (0..model.places()).find(|index| {
+    (0..model.place_count()).find(|index| {
         let offsets = (0..3).map(|c| c * layout.plane + layout.offset(*index));
         !offsets.into_iter().all(|at| state.fields().all(|field| is_good(field, at)))
     })

@@ -15,6 +15,18 @@ pub(crate) fn tiles(points: usize) -> usize {
     points.div_ceil(TILE)
 }
 
+/// Returns the tile of a point, by its row and column in memory.
+pub(crate) fn tile_of(layout: &Layout, [i, j]: [usize; 2]) -> usize {
+    i / TILE * tiles(layout.columns) + j / TILE
+}
+
+/// Returns the rows and columns of a tile.
+pub(crate) fn sides_of(layout: &Layout, tile: usize) -> [Range<usize>; 2] {
+    let columns = tiles(layout.columns);
+    let side = |from: usize, points: usize| from..(from + TILE).min(points);
+    [side(tile / columns * TILE, layout.rows), side(tile % columns * TILE, layout.columns)]
+}
+
 /// A set of tiles. Iterating and clearing cost as much as the set holds, whatever the size of the tissue.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Marks {

@@ -118,7 +118,7 @@ struct SharedPressure {
 
 impl SharedPressure {
     fn of(model: &Model, window: &Window, free: &[bool], turn: &DMat3) -> Option<Self> {
-        let places = model.graph.as_ref()?.volume.as_ref()?;
+        let places = model.places.volume()?;
         let volume = model.scene.volume()?;
         let unit_m2 = model.unit_m * model.unit_m;
         let pa_per_m3 = model.scene.volume_stiffness_pa / volume.volume_m3;
@@ -441,7 +441,7 @@ const YIELDING: u64 = 100_000_000;
 /// Returns by how much each place of a mesh that encloses a volume lets it grow under a pressure, at rest,
 /// m³/Pa. Empty without a volume.
 pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
-    let Some(volume) = model.graph.as_ref().and_then(|graph| graph.volume.as_ref()) else { return Vec::new() };
+    let Some(volume) = model.places.volume() else { return Vec::new() };
     let (window, unit_m2) = (Window::Ball((0..model.len()).collect()), model.unit_m * model.unit_m);
     let zero = vec![DVec3::ZERO; window.len()];
     let patch = LinearPatch::weighted(model, vec![0.0; window.len()], window, zero, &DMat3::IDENTITY);

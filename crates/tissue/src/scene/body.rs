@@ -120,6 +120,11 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         Vec::new()
     }
 
+    /// Returns whether frames may show vertices between the points; otherwise they show the points alone.
+    fn can_refine(&self) -> bool {
+        false
+    }
+
     /// Returns the measured cost of a point relative to a point of a sheet.
     fn relative_cost(&self) -> f64 {
         1.0

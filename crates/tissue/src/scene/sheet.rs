@@ -159,6 +159,10 @@ impl BodyKind for Sheet {
         self
     }
 
+    fn can_refine(&self) -> bool {
+        true
+    }
+
     fn shared_shape(&self) -> Arc<dyn RestShape> {
         Arc::new(self.clone())
     }

@@ -17,6 +17,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::body::tables::springs_of;
 use crate::guard::checkpoint::Checkpoint;
 use crate::guard::convert;
 use crate::interface::Tissue;
@@ -29,7 +30,7 @@ pub use crate::scene::record::AuditedError;
 use crate::scheme::Oscillator;
 use crate::select::audit_window::{AuditWindow, Replay, Resume};
 pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
-use crate::state::tissue_state::{TissueState, springs_of};
+use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 
 /// How many substeps of the twin (the repetition in f64) usually replace one of the tissue: the argument
@@ -257,7 +258,7 @@ impl<T: Real> TissueState<T> {
         let kept = kept.iter_mut().zip(&self.state.kept).map(|(to, from)| (Arc::make_mut(to), &**from));
         let (from, to) = (self.tables.layout, sheet.tables.layout);
         for (number, (wide, narrow)) in pairs.chain(kept).enumerate() {
-            for index in 0..self.model.places() {
+            for index in 0..self.model.place_count() {
                 for c in 0..3 {
                     let at = c * from.plane + from.offset(index);
                     // The rounding error of a compensated displacement belongs to it.

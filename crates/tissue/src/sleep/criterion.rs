@@ -17,7 +17,7 @@ impl<T: Real> TissueState<T> {
         let spacing_m = model.unit_m;
         for change in applied.changes(model, *steps) {
             // A force moves its centre at least as far as if all springs held the centre.
-            let heaviest = model.graph.as_ref().map_or(1.0, |graph| graph.largest_mass);
+            let heaviest = model.places.largest_mass();
             let stiffness = model.omega_bound_per_s.powi(2) * model.scene.point_mass_kg() * heaviest;
             if stiffness > 0.0 {
                 tiles.largest = tiles.largest.max(change.peak_n() / (stiffness * spacing_m));
@@ -103,7 +103,7 @@ impl<T: Real> TissueState<T> {
             pull: anchor_stiffness * scale,
         };
         // Where K″ is smaller, the same imbalance moves a point farther.
-        let least = model.graph.as_ref().map_or(anchor_stiffness, |graph| anchor_stiffness * (1.0 + graph.least_extra));
+        let least = anchor_stiffness * (1.0 + model.places.least_extra_anchor());
         let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * least + unknown * survey.largest);
         let mut region = tiles.no_region();
         let mut sleepers = Vec::new();

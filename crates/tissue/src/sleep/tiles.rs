@@ -26,12 +26,11 @@
 
 use std::cell::Cell;
 use std::ops::Range;
-use std::sync::Arc;
 
-use crate::body::surface::MeshPlaces;
+use crate::body::tile_graph::{TileGraph, Watches};
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::real::Real;
-use crate::kernel::region::{Marks, Region, TILE, tiles};
+use crate::kernel::region::{Marks, Region, sides_of, tile_of, tiles};
 use crate::memory;
 use crate::model::Model;
 use crate::scene::Scene;
@@ -51,15 +50,6 @@ const PART: f64 = 0.25;
 
 /// Factor by which the recent largest displacement decays from one check to the next.
 const FORGET: f64 = 0.99;
-
-/// Offsets of a tile's neighbours: along x, along y.
-const NEIGHBOURS: [[isize; 2]; 8] = [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];
-
-/// Indices of the neighbours in which springs begin that reach the tile.
-const PULLING: [usize; 3] = [0, 1, 3];
-
-/// Number of values in a snapshot: three for each of 16 points, for each side and corner.
-const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 
 /// The name of the tables in messages.
 const TABLES: &str = "the tiles of a tissue";
@@ -105,42 +95,13 @@ impl<T: Real> TakenTiles<T> {
     }
 }
 
-/// Returns the rows and columns of a tile.
-pub(crate) fn sides_of(layout: &Layout, tile: usize) -> [Range<usize>; 2] {
-    let columns = tiles(layout.columns);
-    let side = |from: usize, points: usize| from..(from + TILE).min(points);
-    [side(tile / columns * TILE, layout.rows), side(tile % columns * TILE, layout.columns)]
-}
-
-/// Points next to a sleeping tile of a sheet, in an awake tile.
-#[derive(Debug, Clone, Copy)]
-struct EdgeWatch {
-    tile: usize,
-    /// The side of the tile, as an index into [`NEIGHBOURS`].
-    side: usize,
-    /// The first point, and the distance to the next.
-    first: usize,
-    next: usize,
-    count: usize,
-}
-
-impl EdgeWatch {
-    /// Returns where the snapshots have the earlier positions of its points.
-    fn then(&self) -> usize {
-        self.tile * SNAPSHOT + self.side * 3 * TILE
-    }
-}
-
 /// Which tiles of a tissue sleep, and the values kept for waking them.
 #[derive(Debug)]
 pub(crate) struct SleepTiles<T> {
     layout: Layout,
-    /// Tiles along x and along y.
-    counts: [usize; 2],
     /// Number of rows over which a spring reaches.
     reach: usize,
-    /// Which tiles of a mesh have springs between them; `None` for a sheet.
-    graph: Option<Arc<MeshPlaces>>,
+    graph: TileGraph,
     /// Number of points.
     points: usize,
     /// The sleep tolerance; at 0 nothing sleeps.
@@ -161,10 +122,7 @@ pub(crate) struct SleepTiles<T> {
     volume_change: Vec<f64>,
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
-    /// The comparisons of sleeping tiles next to awake ones, on a sheet.
-    watches: Vec<EdgeWatch>,
-    /// The sleeping tiles that have springs to awake ones, on a mesh.
-    watched: Vec<usize>,
+    watches: Watches,
     /// Tiles that were awake since the last checkpoint.
     touched: Marks,
     /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved:
@@ -177,17 +135,14 @@ pub(crate) struct SleepTiles<T> {
 impl<T: Real> SleepTiles<T> {
     /// Creates the tiles of a tissue at rest: all asleep if there is a tolerance, otherwise all awake forever.
     pub(crate) fn new(layout: Layout, model: &Model) -> Self {
-        let reach = if model.scene.springs.bending { 2 } else { 1 };
-        let joined = (model.graph.clone(), model.len());
-        SleepTiles::asleep(layout, model.tile_tolerance(), reach, joined)
+        let graph = TileGraph::of(layout, model);
+        SleepTiles::asleep(layout, model.tile_tolerance(), model.spring_rows(), graph, model.len())
     }
 
-    fn asleep(layout: Layout, tolerance: f64, reach: usize, (graph, points): (Option<Arc<MeshPlaces>>, usize)) -> Self {
-        let counts = [tiles(layout.rows), tiles(layout.columns)];
-        let count = counts[0] * counts[1];
+    fn asleep(layout: Layout, tolerance: f64, reach: usize, graph: TileGraph, points: usize) -> Self {
+        let count = tiles(layout.rows) * tiles(layout.columns);
         let mut tiles = SleepTiles {
             layout,
-            counts,
             reach,
             graph,
             points,
@@ -201,8 +156,7 @@ impl<T: Real> SleepTiles<T> {
             elastic_j: memory::filled(count, Cell::new(None), TABLES),
             volume_change: Vec::new(),
             snapshots: Vec::new(),
-            watches: Vec::new(),
-            watched: Vec::new(),
+            watches: Watches::default(),
             touched: Marks::none_of(count),
             moved: Marks::none_of(count),
             largest: 0.0,
@@ -223,8 +177,7 @@ impl<T: Real> SleepTiles<T> {
             elastic_j: Vec::new(),
             volume_change: Vec::new(),
             snapshots: Vec::new(),
-            watches: Vec::new(),
-            watched: Vec::new(),
+            watches: Watches::default(),
             touched: Marks::default(),
             moved: self.moved.clone(),
             graph: self.graph.clone(),
@@ -258,13 +211,7 @@ impl<T: Real> SleepTiles<T> {
     /// Returns where sleeping tiles that have moved remember the points around them, in their order.
     fn places_remembered(&self) -> impl Iterator<Item = Range<usize>> + '_ {
         let asleep = self.moved.members.iter().filter(|tile| !self.region.awake.has[**tile]);
-        asleep.map(|tile| match &self.graph {
-            Some(graph) => {
-                let (slots, first) = graph.around(*tile);
-                3 * first..3 * (first + slots.len())
-            }
-            None => tile * SNAPSHOT..(tile + 1) * SNAPSHOT,
-        })
+        asleep.map(|tile| self.graph.remembered(*tile))
     }
 
     /// Returns the number of tiles.
@@ -298,7 +245,7 @@ impl<T: Real> SleepTiles<T> {
                 self.region.awake.add(tile);
             }
         }
-        let has_moved = |tile: &usize| self.pulling(*tile).chain([*tile]).all(|other| self.moved.has[other]);
+        let has_moved = |tile: &usize| self.graph.pulling(*tile).chain([*tile]).all(|other| self.moved.has[other]);
         ensure(self.region.awake.members.iter().all(has_moved), "a tile that is awake and has never moved")?;
         ensure(self.may_sleep() || self.region.awake.is_full(), "a tile that sleeps where none may")?;
         ensure(
@@ -350,102 +297,22 @@ impl<T: Real> SleepTiles<T> {
     }
 
     /// Returns the tile of a point.
-    pub(crate) fn of(&self, [i, j]: [usize; 2]) -> usize {
-        i / TILE * self.counts[1] + j / TILE
-    }
-
-    fn rows(&self, tile: usize) -> Range<usize> {
-        let from = tile / self.counts[1] * TILE;
-        from..(from + TILE).min(self.layout.rows)
-    }
-
-    fn columns(&self, tile: usize) -> Range<usize> {
-        let from = tile % self.counts[1] * TILE;
-        from..(from + TILE).min(self.layout.columns)
+    pub(crate) fn of(&self, point: [usize; 2]) -> usize {
+        tile_of(&self.layout, point)
     }
 
     /// Updates everything to the set of awake tiles. Costs as much as those, not as much as the tissue.
     fn settle(&mut self) {
         self.region.cover(&self.layout, self.reach);
         self.awake_points = 0;
-        self.watches.clear();
-        self.watched.clear();
-        for index in 0..self.region.tiles().len() {
-            let tile = self.region.tiles()[index];
-            self.awake_points += self.rows(tile).len() * self.columns(tile).len();
-            self.touched.add(tile);
-            if let Some(graph) = &self.graph {
-                self.watched.extend(graph.beside(tile).filter(|other| !self.region.awake.has[*other]));
-                continue;
-            }
-            // The order of neighbours is the reverse of that of their opposites.
-            for (side, opposite) in (0..NEIGHBOURS.len()).zip((0..NEIGHBOURS.len()).rev()) {
-                let beside = self.neighbour(tile, opposite);
-                if let Some(other) = beside.filter(|other| !self.region.awake.has[*other]) {
-                    let (first, next, count) = self.beyond(other, side);
-                    self.watches.push(EdgeWatch { tile: other, side, first, next, count });
-                }
-            }
+        for tile in self.region.tiles() {
+            let [rows, columns] = sides_of(&self.layout, *tile);
+            self.awake_points += rows.len() * columns.len();
+            self.touched.add(*tile);
         }
-        self.watched.sort_unstable();
-        self.watched.dedup();
+        self.graph.watch(&self.region.awake, &mut self.watches);
         // The last tile of a mesh has empty places.
         self.awake_points = self.awake_points.min(self.points);
-    }
-
-    /// Returns the tiles that springs join to a tile.
-    fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        let of_mesh = self.graph.iter().flat_map(move |graph| graph.beside(tile));
-        let sides = if self.graph.is_some() { 0 } else { NEIGHBOURS.len() };
-        of_mesh.chain((0..sides).filter_map(move |side| self.neighbour(tile, side)))
-    }
-
-    /// Returns the tiles in which springs begin that reach a tile: on a mesh, all that are joined to it.
-    fn pulling(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        let of_mesh = self.graph.iter().flat_map(move |graph| graph.beside(tile));
-        let sides = if self.graph.is_some() { &[][..] } else { &PULLING };
-        of_mesh.chain(sides.iter().filter_map(move |side| self.neighbour(tile, *side)))
-    }
-
-    fn neighbour(&self, tile: usize, side: usize) -> Option<usize> {
-        let [x, y] = NEIGHBOURS[side];
-        let [i, j] = [(tile / self.counts[1]).checked_add_signed(x)?, (tile % self.counts[1]).checked_add_signed(y)?];
-        (i < self.counts[0] && j < self.counts[1]).then_some(i * self.counts[1] + j)
-    }
-
-    /// Returns the points beyond a side or corner: the first offset, the distance to the next, and their
-    /// number.
-    fn beyond(&self, tile: usize, side: usize) -> (usize, usize, usize) {
-        let Layout { stride, .. } = self.layout;
-        let (rows, columns) = (self.rows(tile), self.columns(tile));
-        let [x, y] = NEIGHBOURS[side];
-        let (i, count_x) = match x {
-            -1 => (rows.start - 1, 1),
-            0 => (rows.start, rows.len()),
-            _ => (rows.end, 1),
-        };
-        let (j, count_y) = match y {
-            -1 => (columns.start - 1, 1),
-            0 => (columns.start, columns.len()),
-            _ => (columns.end, 1),
-        };
-        (i * stride + j, if x == 0 { stride } else { 1 }, count_x.max(count_y))
-    }
-
-    /// Returns how many rows motion travels in `sweeps` sweeps; not beyond the neighbouring tiles.
-    fn front(&self, sweeps: usize) -> usize {
-        (self.reach * sweeps).min(TILE)
-    }
-
-    /// Returns up to `front` rows and columns beyond a side or corner.
-    fn near(&self, tile: usize, side: usize, front: usize) -> [Range<usize>; 2] {
-        let beyond = |own: Range<usize>, way: isize, count: usize| match way {
-            -1 => own.start.saturating_sub(front)..own.start,
-            0 => own,
-            _ => own.end..(own.end + front).min(count),
-        };
-        let [x, y] = NEIGHBOURS[side];
-        [beyond(self.rows(tile), x, self.layout.rows), beyond(self.columns(tile), y, self.layout.columns)]
     }
 
     /// Wakes the sleeping tiles among `which`.
@@ -456,9 +323,9 @@ impl<T: Real> SleepTiles<T> {
                 any = true;
                 self.asleep_j -= self.energy_j[tile];
                 self.settled[tile] = 0;
-                self.beside(tile).chain([tile]).for_each(|other| self.elastic_j[other].set(None));
+                self.graph.beside(tile).chain([tile]).for_each(|other| self.elastic_j[other].set(None));
                 let mut moved = std::mem::take(&mut self.moved);
-                self.pulling(tile).chain([tile]).for_each(|other| _ = moved.add(other));
+                self.graph.pulling(tile).chain([tile]).for_each(|other| _ = moved.add(other));
                 self.moved = moved;
             }
         }
@@ -469,21 +336,14 @@ impl<T: Real> SleepTiles<T> {
 
     /// Wakes the tiles that contain the points.
     pub(crate) fn wake_under(&mut self, points: impl IntoIterator<Item = [usize; 2]>) {
-        let columns = self.counts[1];
-        self.wake(points.into_iter().map(|[i, j]| i / TILE * columns + j / TILE));
+        let layout = self.layout;
+        self.wake(points.into_iter().map(|point| tile_of(&layout, point)));
     }
 
     /// Wakes the tile of a point and those that its springs reach in `sweeps` sweeps.
     pub(crate) fn wake_around(&mut self, point: [usize; 2], sweeps: usize) {
-        if let Some(graph) = self.graph.clone() {
-            let tile = self.of(point);
-            return self.wake(graph.beside(tile).chain([tile]));
-        }
-        let Layout { rows, columns, .. } = self.layout;
-        let front = self.front(sweeps);
-        let [i, j] = [(point[0], rows), (point[1], columns)]
-            .map(|(at, count)| [at.saturating_sub(front), (at + front).min(count - 1)]);
-        self.wake_under([[i[0], j[0]], [i[0], j[1]], [i[1], j[0]], [i[1], j[1]]]);
+        let graph = self.graph.clone();
+        self.wake(graph.reached(point, sweeps));
     }
 
     pub(crate) fn wake_all(&mut self) {
@@ -500,47 +360,12 @@ impl<T: Real> SleepTiles<T> {
 
     /// Wakes tiles whose neighbours have moved by more than `far`: points next to a tile since it fell asleep,
     /// and on a sheet also points whose motion reaches it in the `sweeps` of a substep, in the substep before.
-    pub(crate) fn wake_beside_moved(&mut self, [u, d]: [&Field<T>; 2], sweeps: usize, far: f64) {
-        if self.watches.is_empty() && self.watched.is_empty() {
+    pub(crate) fn wake_beside_moved(&mut self, moved: [&Field<T>; 2], sweeps: usize, far: f64) {
+        if self.watches.is_empty() {
             return;
         }
         self.remember();
-        let far = T::of(far);
-        if let Some(graph) = &self.graph {
-            let moved = |tile: &&usize| {
-                let (slots, first) = graph.around(**tile);
-                (0..3).any(|c| {
-                    let place = |slot: &u32| c * self.layout.plane + self.layout.offset(*slot as usize);
-                    let then = &self.snapshots[3 * first + c * slots.len()..][..slots.len()];
-                    let any = |any: bool, (slot, then): (&u32, &T)| any | ((u[place(slot)] - *then).magnitude() > far);
-                    slots.iter().zip(then).fold(false, any)
-                })
-            };
-            let waking: Vec<usize> = self.watched.iter().filter(moved).copied().collect();
-            return self.wake(waking);
-        }
-        let front = self.front(sweeps);
-        let is_near_fast = |watch: &EdgeWatch| {
-            let [rows, columns] = self.near(watch.tile, watch.side, front);
-            (0..3).any(|c| {
-                let row = |i: usize| &d[c * self.layout.plane + i * self.layout.stride..][columns.clone()];
-                rows.clone().any(|i| row(i).iter().fold(false, |any, d| any | (d.magnitude() > far)))
-            })
-        };
-        let moved = |watch: &&EdgeWatch| {
-            let (EdgeWatch { first, next, count, .. }, then) = (**watch, watch.then());
-            (0..3).any(|c| {
-                let (here, then) = (&u[c * self.layout.plane + first..], &self.snapshots[then + c * TILE..][..count]);
-                // Compares all of them without an early exit, so that it compiles to a few vectors.
-                let any = |any: bool, (now, then): (&T, &T)| any | ((*now - *then).magnitude() > far);
-                if next == 1 {
-                    here[..count].iter().zip(then).fold(false, any)
-                } else {
-                    here.iter().step_by(next).zip(then).fold(false, any)
-                }
-            }) || front > 1 && is_near_fast(watch)
-        };
-        let waking: Vec<usize> = self.watches.iter().filter(moved).map(|watch| watch.tile).collect();
+        let waking = self.graph.woken(&self.watches, moved, &self.snapshots, sweeps, T::of(far));
         self.wake(waking);
     }
 
@@ -563,7 +388,7 @@ impl<T: Real> SleepTiles<T> {
     /// Allocates the snapshots. Before the first sleep, all points were at 0.
     fn remember(&mut self) {
         if self.snapshots.is_empty() {
-            let values = self.graph.as_ref().map_or(self.settled.len() * SNAPSHOT, |graph| 3 * graph.watched_slots());
+            let values = self.graph.remembered_values(self.settled.len());
             self.snapshots = memory::zeroed(values, TABLES);
         }
     }
@@ -574,36 +399,13 @@ impl<T: Real> SleepTiles<T> {
     /// meet a sleeping tile.
     pub(crate) fn pushed(&mut self, change: &ForceChange, spacing_m: f64, least_n: f64) {
         let mut waking = Vec::new();
-        if let Some(graph) = self.graph.clone() {
-            for tile in (0..self.settled.len()).filter(|tile| !self.region.awake.has[*tile]) {
-                self.drift_n[tile] += change.most_n(graph.box_of(tile)) / graph.least_pull(tile);
-                if self.drift_n[tile] > least_n {
-                    waking.push(tile);
-                }
+        let SleepTiles { graph, region, drift_n, .. } = self;
+        graph.force_changes(change, spacing_m, least_n <= 0.0, &region.awake.has, |tile, changed_n| {
+            drift_n[tile] += changed_n;
+            if drift_n[tile] > least_n {
+                waking.push(tile);
             }
-            return self.wake(waking);
-        }
-        let within = |sides: [Range<usize>; 2]| sides.map(|points| points.start / TILE..tiles(points.end));
-        let [old, new] = match change.reached() {
-            reached if least_n > 0.0 => reached.map(within),
-            _ => [self.counts.map(|count| 0..count), [0..0, 0..0]],
-        };
-        let is_old = |row, column| old[0].contains(&row) && old[1].contains(&column);
-        for (which, [rows, columns]) in [&old, &new].into_iter().enumerate() {
-            for (row, column) in rows.clone().flat_map(|row| columns.clone().map(move |column| (row, column))) {
-                let tile = row * self.counts[1] + column;
-                if self.region.awake.has[tile] || which == 1 && is_old(row, column) {
-                    continue;
-                }
-                #[allow(clippy::cast_precision_loss)]
-                let sides = [self.rows(tile), self.columns(tile)]
-                    .map(|range| [range.start as f64 * spacing_m, (range.end - 1) as f64 * spacing_m]);
-                self.drift_n[tile] += change.most_n(&sides);
-                if self.drift_n[tile] > least_n {
-                    waking.push(tile);
-                }
-            }
-        }
+        });
         self.wake(waking);
     }
 
@@ -618,7 +420,7 @@ impl<T: Real> SleepTiles<T> {
     pub(crate) fn quiescent_tiles(&mut self, u: &Field<T>, d: &Field<T>, slow: impl Fn(f64) -> f64) -> Vec<usize> {
         let Layout { stride, plane, .. } = self.layout;
         let most = |field: &Field<T>, tile: usize| {
-            let (rows, columns) = (self.rows(tile), self.columns(tile));
+            let [rows, columns] = sides_of(&self.layout, tile);
             let of = |range: &Range<usize>| [range.start, range.start + range.len() / 2, range.end - 1];
             let mut most = 0.0_f64;
             for i in of(&rows) {
@@ -660,7 +462,7 @@ impl<T: Real> SleepTiles<T> {
     /// Caches the energies of a sleeping tile if nothing can change them before it or a neighbour wakes. (In a
     /// multistep scheme the observed displacement depends on the springs' force, and so on all tiles around.)
     pub(crate) fn keep_energies(&self, tile: usize, elastic_j: [f64; 2]) {
-        if !self.beside(tile).any(|other| self.region.awake.has[other]) {
+        if !self.graph.beside(tile).any(|other| self.region.awake.has[other]) {
             self.elastic_j[tile].set(Some(elastic_j));
         }
     }
@@ -679,28 +481,7 @@ impl<T: Real> SleepTiles<T> {
             self.energy_j[tile] = energy_j;
             self.asleep_j += energy_j;
             self.drift_n[tile] = 0.0;
-            if let Some(graph) = &self.graph {
-                let (slots, first) = graph.around(tile);
-                for c in 0..3 {
-                    for (slot, k) in slots.iter().zip(0..) {
-                        let place = c * self.layout.plane + self.layout.offset(*slot as usize);
-                        self.snapshots[3 * first + c * slots.len() + k] = u[place];
-                    }
-                }
-                continue;
-            }
-            for side in 0..NEIGHBOURS.len() {
-                if self.neighbour(tile, side).is_none() {
-                    continue;
-                }
-                let (first, next, count) = self.beyond(tile, side);
-                let into = tile * SNAPSHOT + side * 3 * TILE;
-                for c in 0..3 {
-                    for k in 0..count {
-                        self.snapshots[into + c * TILE + k] = u[c * self.layout.plane + first + k * next];
-                    }
-                }
-            }
+            self.graph.remember(tile, u, &mut self.snapshots);
         }
         self.settle();
     }
@@ -729,9 +510,9 @@ impl<T: Real> SleepTiles<T> {
             return to.copy_from_slice(from);
         }
         for tile in &which.members {
-            let columns = self.columns(*tile);
+            let [rows, columns] = sides_of(&self.layout, *tile);
             for c in 0..3 {
-                for i in self.rows(*tile) {
+                for i in rows.clone() {
                     let row = c * self.layout.plane + i * self.layout.stride;
                     let place = row + columns.start..row + columns.end;
                     to[place.clone()].copy_from_slice(&from[place]);

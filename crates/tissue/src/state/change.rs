@@ -7,13 +7,14 @@
 
 use std::sync::Arc;
 
+use crate::body::tables::springs_of;
 use crate::guard::checkpoint::Work;
 use crate::guard::survey::{Forces, Survey, Write};
 use crate::kernel::field::{Field, State};
 use crate::kernel::real::Real;
 use crate::model::Model;
 use crate::scene::Precision;
-use crate::state::tissue_state::{TissueState, springs_of};
+use crate::state::tissue_state::TissueState;
 
 impl<T: Real> TissueState<T> {
     /// Uses `model`, which has the same points and number format, from the next step on.

@@ -8,22 +8,23 @@ use std::sync::Arc;
 
 use xxhash_rust::xxh3::Xxh3;
 
-use crate::body;
+use crate::body::tables::springs_of;
 use crate::guard::checkpoint::{Checkpoint, Input, Work};
 use crate::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
+use crate::kernel::region::sides_of;
 use crate::limits::Limits;
 use crate::memory;
 use crate::model::{Model, Plan};
 use crate::scene::{Named, Precision};
-use crate::sleep::tiles::{TakenTiles, sides_of};
+use crate::sleep::tiles::TakenTiles;
 use crate::state::saved::{
     Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedPrescribed, SavedState,
     SavedTissue, TissueParts, ensure, unsound,
 };
-use crate::state::tissue_state::{TissueState, springs_of};
+use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;
@@ -108,7 +109,7 @@ impl Model {
         add(self.plan.integrator.name().as_bytes());
         add(&self.plan.substeps.to_le_bytes());
         add(self.precision.name().as_bytes());
-        body::identify(scene, self.graph.as_deref(), &mut add);
+        self.places.identify(scene, &mut add);
         hasher.digest128()
     }
 }

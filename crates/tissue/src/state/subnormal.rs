@@ -29,9 +29,9 @@ fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
         let mut sheet = TissueState::<T>::new(&model);
         let poke = Poke {
             point: None,
-            centre_m: scene.sheet().unwrap().spacing_m * DVec3::new(2.0, 7.0, 0.0),
+            centre_m: scene.shape().edge_m() * DVec3::new(2.0, 7.0, 0.0),
             force_n: DVec3::new(0.2, -0.1, 1.0),
-            falloff_per_m: 1.0 / (1.3 * scene.sheet().unwrap().spacing_m),
+            falloff_per_m: 1.0 / (1.3 * scene.shape().edge_m()),
             falloff_offset: 0.0,
         };
         sheet.push(0, Some(Push::Constant(poke)));

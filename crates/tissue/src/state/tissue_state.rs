@@ -7,13 +7,12 @@ use std::sync::Arc;
 use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
-use crate::body::tables::{Elastic, SweepTables};
+use crate::body::tables::{SweepTables, springs_of};
 use crate::guard::checkpoint::{Checkpoint, Input, Repetition, Work};
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::lanes::Scalar;
 use crate::kernel::real::Real;
-use crate::kernel::springs::{SpringCoefficients, Springs};
 use crate::model::{Model, Plan};
 use crate::scene::Precision;
 use crate::scene::profile::{Moment, Motion, Poke};
@@ -307,26 +306,12 @@ impl<T: Real> TissueState<T> {
 /// displacement in spacings.
 pub(crate) fn spring_force_n(model: &Model, plan: &Plan, index: usize, gathered: f64, u: f64) -> f64 {
     let force_n = gathered / (plan.scheme.spring_scale() * plan.force_scale(&model.scene));
-    if model.graph.is_none() {
+    if !model.places.differ() {
         return force_n;
     }
     // Anchor stiffness beyond the reference K″ is not part of the springs.
     let pulled_n = model.scene.anchor_stiffness_n_per_m * model.extra_anchor_at(index) * u * model.unit_m;
     model.relative_mass_at(index) * (force_n + pulled_n)
-}
-
-/// Returns the springs of a model in the units of a plan.
-pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
-    let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
-    match &model.graph {
-        None => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
-        Some(graph) => Elastic::Mesh(
-            graph.clone(),
-            SpringCoefficients::new(unit * model.scene.springs.stiffness_n_per_m, 1.0),
-            T::of(unit * model.scene.anchor_stiffness_n_per_m),
-            graph.volume.as_ref().map_or(0.0, |volume| unit * model.scene.volume_stiffness_pa * volume.stretch_m),
-        ),
-    }
 }
 
 impl<T: Real> Tissue for TissueState<T> {
@@ -489,7 +474,7 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn largest_displacement_m(&self) -> f64 {
-        let squared = (0..self.model.places()).map(|index| {
+        let squared = (0..self.model.place_count()).map(|index| {
             let at = self.tables.layout.offset(index);
             (0..3).map(|c| self.state.u[c * self.tables.layout.plane + at].wide().powi(2)).sum()
         });
@@ -497,7 +482,7 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]) {
-        if self.model.graph.is_none() {
+        if self.model.shown_order().is_none() {
             return self.shown_displacements_m(into);
         }
         let spacing = T::of(self.model.unit_m);

@@ -18,9 +18,8 @@ use std::ops::Range;
 
 use glam::DVec3;
 
-use crate::body::surface::MeshPlaces;
-use crate::kernel::field::{BLOCK, Field, Layout};
-use crate::kernel::lanes::{self, Run, Vector, Width};
+use crate::kernel::field::{Field, Layout};
+use crate::kernel::lanes::{Vector, Width};
 use crate::kernel::real::Real;
 use crate::model::{Model, Plan};
 use crate::scene::profile::{LoadProfile, Moment, Poke};
@@ -70,10 +69,6 @@ pub(crate) struct Slot {
     /// The force with which the sleeping tiles were last compared.
     compared: Option<Poke>,
 }
-
-/// The steepest falloff of a table, per spacing: a steeper one does not reach a second point either. It is
-/// finite in any format, so that its product with the distance 0 is 0.
-const STEEPEST: f64 = 1e30;
 
 /// Largest number of terms of one tool's force: two at each moment at which a scheme evaluates it.
 const MAX_TERMS: usize = 8;
@@ -168,24 +163,6 @@ fn same_falloff(a: &Poke, b: &Poke) -> bool {
     Poke { force_n: b.force_n, point: b.point, ..*a } == *b
 }
 
-/// Returns the points that a force reaches, along x and along y. Beyond them its factor is 0.
-fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
-    let spacing_m = model.unit_m;
-    let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
-    if let Some(graph) = &model.graph {
-        let rows = graph.rows_within(poke.centre_m, reach_m);
-        return [[rows.start, rows.end], [0, if rows.is_empty() { 0 } else { BLOCK }]];
-    }
-    std::array::from_fn(|axis| {
-        let (centre_m, points) = (poke.centre_m[axis], model.points[axis]);
-        // Saturating casts: an infinite reach covers the whole sheet.
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-        let [from, to] = [((centre_m - reach_m) / spacing_m).ceil(), ((centre_m + reach_m) / spacing_m).floor() + 1.0]
-            .map(|edge| (edge.max(0.0) as usize).min(points));
-        [from, to.max(from)]
-    })
-}
-
 impl<T: Real> Term<T> {
     fn new() -> Self {
         let poke =
@@ -204,56 +181,16 @@ impl<T: Real> Term<T> {
     /// Writes the falloff of `poke` to the table. Costs as much as the points that the old and the new falloff
     /// reach.
     fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
-        let spacing_m = model.unit_m;
         // Beyond its spans the table is 0, also where it was longer before.
         for (row, span) in self.factors.chunks_exact_mut(layout.stride).zip(&self.spans) {
             row[span.clone()].fill(T::default());
         }
-        [self.rows, self.columns] = reached::<T>(poke, model).map(|[from, to]| from..to);
+        [self.rows, self.columns] = model.places.reached::<T>(poke).map(|[from, to]| from..to);
         // `libm` gives the same bits on every machine; the platform's exponential does not.
         self.gain = libm::exp(poke.falloff_offset);
         self.factors.resize(self.rows.len() * layout.stride);
-        if let Some(graph) = &model.graph {
-            return self.place_on_mesh(poke, graph, layout);
-        }
-        let falloff = Falloff {
-            centre: (poke.centre_m.truncate() / spacing_m).to_array(),
-            per_spacing: (poke.falloff_per_m * spacing_m).min(STEEPEST),
-            rows: self.rows.clone(),
-            columns: self.columns.clone(),
-            stride: layout.stride,
-            factors: self.factors.as_mut_ptr(),
-        };
-        // SAFETY: `factors` has as many rows, each of whole blocks.
-        unsafe { lanes::run(Width::of(model.lanes), &falloff) };
-        let written = falloff.written(BLOCK);
-        self.spans.clear();
-        self.spans.extend(self.factors.chunks_exact(layout.stride).map(|row| {
-            let counts = |block: &[T]| block.iter().any(|factor| *factor != T::default());
-            let mut blocks = row[written.clone()].chunks(BLOCK);
-            let place = |block: usize| written.start + block * BLOCK;
-            match (blocks.clone().position(counts), blocks.rposition(counts)) {
-                (Some(first), Some(last)) => place(first)..place(last + 1),
-                _ => 0..0,
-            }
-        }));
-    }
-
-    /// Writes the falloff for points anywhere in space: a row is a block of slots (places in memory).
-    fn place_on_mesh(&mut self, poke: &Poke, graph: &MeshPlaces, layout: &Layout) {
-        self.spans.clear();
-        for (factors, row) in self.factors.chunks_exact_mut(layout.stride).zip(self.rows.clone()) {
-            let mut any = false;
-            for ((factor, place_m), slot) in factors.iter_mut().zip(graph.rest_in_row(row)).zip(row * BLOCK..) {
-                let exponent = -poke.falloff_per_m * place_m.distance(poke.centre_m);
-                // An empty slot has no place.
-                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && place_m.is_finite();
-                let moves = || libm::exp(exponent) / graph.slots.mass(slot);
-                *factor = if reaches { T::of(moves()) } else { T::default() };
-                any |= *factor != T::default();
-            }
-            self.spans.push(if any { 0..BLOCK } else { 0..0 });
-        }
+        let points = [self.rows.clone(), self.columns.clone()];
+        model.places.fall_off(Width::of(model.lanes), poke, layout, points, &mut self.factors, &mut self.spans);
     }
 
     fn set(&mut self, wanted: Wanted, scale: f64) {
@@ -266,85 +203,6 @@ impl<T: Real> Term<T> {
         if self.rows.contains(&i) { self.factors[(i - self.rows.start) * layout.stride + j] } else { T::default() }
     }
 }
-
-/// Fills a table with a falloff.
-struct Falloff<T> {
-    /// In spacings, from the first point.
-    centre: [f64; 2],
-    per_spacing: f64,
-    rows: Range<usize>,
-    columns: Range<usize>,
-    stride: usize,
-    factors: *mut T,
-}
-
-impl<T> Falloff<T> {
-    /// Returns the places of a row that are written, in blocks of `length`.
-    #[inline(always)]
-    fn written(&self, length: usize) -> Range<usize> {
-        self.columns.start / length * length..self.columns.end.next_multiple_of(length)
-    }
-}
-
-impl<T: Real> Run<T> for Falloff<T> {
-    #[inline(always)]
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    unsafe fn run<V: Vector<Real = T>>(&self) {
-        // SAFETY: the caller's promise.
-        unsafe {
-            let zero = V::of(T::default());
-            let slope = V::of(T::of(-self.per_spacing));
-            let farthest = V::of(T::of(-T::NEGLIGIBLE_EXPONENT));
-            let [_, centre] = self.centre;
-            // Column numbers and the integer part of the centre are exact in any format; only the fraction is rounded.
-            let (whole, rest) = (V::of(T::of(centre.floor())), V::of(T::of(centre - centre.floor())));
-            for i in self.rows.clone() {
-                let x = T::of(i as f64 - self.centre[0]);
-                let x = V::of(x * x);
-                for at in self.written(V::LANES).step_by(V::LANES) {
-                    let y = zero.count(at).sub(whole).sub(rest);
-                    let exponent = slope.mul(y.mul_add(y, x).root());
-                    let far = exponent.beyond(farthest);
-                    let factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
-                    // The columns bound the reach more exactly than this format.
-                    let factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
-                    debug_assert!(at + V::LANES <= self.stride);
-                    factor.store(self.factors.add((i - self.rows.start) * self.stride + at));
-                }
-            }
-        }
-    }
-}
-
-/// Returns e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r|
-/// ≤ ½ln 2. Unlike the platform's function, it has the same bits on every machine.
-#[inline(always)]
-fn exponential<V: Vector>(x: V) -> V {
-    let of = |value: f64| x.splat(V::Real::of(value));
-    // Adding and subtracting a number whose last digit is 1 rounds to an integer.
-    let unit = of(V::Real::UNIT);
-    let k = x.mul_add(of(std::f64::consts::LOG2_E), unit).sub(unit);
-    let [high, low] = V::Real::LN_2;
-    let r = x.minus(k, of(high)).minus(k, of(low));
-    let mut sum = of(INVERSE_FACTORIALS[V::Real::EXPONENTIAL_DEGREE]);
-    for n in (0..V::Real::EXPONENTIAL_DEGREE).rev() {
-        sum = sum.mul_add(r, of(INVERSE_FACTORIALS[n]));
-    }
-    sum.mul(k.power_of_two())
-}
-
-/// 1/n!.
-const INVERSE_FACTORIALS: [f64; 14] = {
-    let mut series = [1.0; 14];
-    let mut n = 1;
-    while n < series.len() {
-        #[allow(clippy::cast_precision_loss)]
-        let next = series[n - 1] / n as f64;
-        series[n] = next;
-        n += 1;
-    }
-    series
-};
 
 /// A term in the form that a sweep uses: pointers and numbers that need no checks.
 #[derive(Clone, Copy)]
@@ -468,19 +326,6 @@ pub(crate) fn rows<T: Real>(terms: &[Term<T>]) -> Range<usize> {
     rows.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
 }
 
-/// Returns the distance at rest of the point at a place in memory from a control point, m.
-#[allow(clippy::cast_precision_loss)]
-fn away_m(model: &Model, index: usize, centre_m: DVec3) -> f64 {
-    match &model.graph {
-        Some(graph) => graph.rest_m(index).distance(centre_m),
-        None => {
-            let ([i, j], spacing_m) = (model.point_of(index), model.unit_m);
-            let (x, y) = (i as f64 * spacing_m - centre_m.x, j as f64 * spacing_m - centre_m.y);
-            (x * x + y * y).sqrt()
-        }
-    }
-}
-
 /// Returns e^{−c·r + c′} at a distance, m; 0 where it is negligible.
 fn factor(poke: &Poke, away_m: f64, negligible: f64) -> f64 {
     let exponent = -poke.falloff_per_m * away_m;
@@ -578,7 +423,8 @@ impl<T: Real> Applied<T> {
         let change = move |slot: &mut Slot| {
             let new = slot.push.as_ref().map(|push| push.at(end, model.scene.stepping.rate_hz));
             let old = std::mem::replace(&mut slot.compared, new);
-            let reached = |poke: Option<Poke>| poke.map_or_else(Default::default, |poke| reached::<T>(&poke, model));
+            let reached =
+                |poke: Option<Poke>| poke.map_or_else(Default::default, |poke| model.places.reached::<T>(&poke));
             (old != new).then(|| ForceChange { old, new, reached: [old, new].map(reached) })
         };
         let slots = if self.settled { 0 } else { self.slots.len() };
@@ -717,7 +563,7 @@ impl<T: Real> Applied<T> {
 }
 
 fn sum_at(model: &Model, index: usize, pokes: impl Iterator<Item = Poke>, negligible: f64) -> DVec3 {
-    pokes.map(|poke| poke.force_n * factor(&poke, away_m(model, index, poke.centre_m), negligible)).sum()
+    pokes.map(|poke| poke.force_n * factor(&poke, model.places.away_m(index, poke.centre_m), negligible)).sum()
 }
 
 #[cfg(test)]

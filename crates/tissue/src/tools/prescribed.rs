@@ -41,7 +41,7 @@ impl Grasp {
 /// Checks the place in memory of a point that a snapshot lists as grasped, and returns it.
 #[allow(clippy::cast_possible_truncation)]
 pub(crate) fn restored_index(model: &Model, index: u64, checks: &Checks<'_>) -> Result<usize> {
-    ensure(index < model.places() as u64, "a grasped point that the tissue lacks")?;
+    ensure(index < model.place_count() as u64, "a grasped point that the tissue lacks")?;
     let index = index as usize;
     let point = model.point_at(index);
     ensure(model.place_of(point) == index, "a grasped point that the tissue lacks")?;

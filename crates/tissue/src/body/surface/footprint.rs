@@ -116,7 +116,7 @@ impl MeshDisc {
     /// Moves the disc to the place of the rest surface nearest to `place_m`, if the displaced surface is nearer
     /// there than at the disc. Returns whether it moved.
     pub(crate) fn leap(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) -> bool {
-        let (surface, Some(graph)) = (self.shape.surface(), &model.graph) else { return false };
+        let (surface, Some(graph)) = (self.shape.surface(), model.places.surface()) else { return false };
         let Some(other) = surface.nearest(place_m) else { return false };
         let away_m = |place: &Place| {
             let vertices = surface.triangle(place).map(|vertex| PointId::new(vertex as usize));

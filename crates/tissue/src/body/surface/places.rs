@@ -8,9 +8,11 @@ use glam::DVec3;
 use super::graph::{GraphFault, MeshGraph, MeshSpring};
 use super::order::{TABLES, TILE_SLOTS};
 use super::slots::{MeshSlots, NO_VERTEX};
-use crate::kernel::field::BLOCK;
+use crate::kernel::field::{BLOCK, Field, Layout};
+use crate::kernel::real::Real;
 use crate::memory;
 use crate::scene::Mesh;
+use crate::scene::profile::Poke;
 use crate::shape::{Extent, PointId, RestShape};
 
 /// The slots of a mesh, and their positions in space.
@@ -201,6 +203,59 @@ impl MeshPlaces {
     pub(crate) fn around(&self, tile: usize) -> (&[u32], usize) {
         let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
         (&self.around[from..to], from)
+    }
+
+    /// Writes the falloff of `poke`, e^(−c·r) divided by the relative mass, over some rows, and which of them are not 0.
+    pub(crate) fn fall_off<T: Real>(
+        &self,
+        poke: &Poke,
+        layout: &Layout,
+        rows: Range<usize>,
+        factors: &mut Field<T>,
+        spans: &mut Vec<Range<usize>>,
+    ) {
+        spans.clear();
+        for (factors, row) in factors.chunks_exact_mut(layout.stride).zip(rows) {
+            let mut any = false;
+            for ((factor, place_m), slot) in factors.iter_mut().zip(self.rest_in_row(row)).zip(row * BLOCK..) {
+                let exponent = -poke.falloff_per_m * place_m.distance(poke.centre_m);
+                // An empty slot has no place.
+                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && place_m.is_finite();
+                let moves = || libm::exp(exponent) / self.slots.mass(slot);
+                *factor = if reaches { T::of(moves()) } else { T::default() };
+                any |= *factor != T::default();
+            }
+            spans.push(if any { 0..BLOCK } else { 0..0 });
+        }
+    }
+
+    /// Stores where the points around a tile are.
+    pub(crate) fn remember<T: Real>(&self, layout: &Layout, tile: usize, u: &Field<T>, snapshots: &mut [T]) {
+        let (slots, first) = self.around(tile);
+        for c in 0..3 {
+            for (slot, k) in slots.iter().zip(0..) {
+                let place = c * layout.plane + layout.offset(*slot as usize);
+                snapshots[3 * first + c * slots.len() + k] = u[place];
+            }
+        }
+    }
+
+    /// Returns whether a point around a tile is more than `far` from where the tile remembers it.
+    pub(crate) fn has_moved<T: Real>(
+        &self,
+        layout: &Layout,
+        tile: usize,
+        u: &Field<T>,
+        snapshots: &[T],
+        far: T,
+    ) -> bool {
+        let (slots, first) = self.around(tile);
+        (0..3).any(|c| {
+            let place = |slot: &u32| c * layout.plane + layout.offset(*slot as usize);
+            let then = &snapshots[3 * first + c * slots.len()..][..slots.len()];
+            let any = |any: bool, (slot, then): (&u32, &T)| any | ((u[place(slot)] - *then).magnitude() > far);
+            slots.iter().zip(then).fold(false, any)
+        })
     }
 
     /// Returns the length of the list of all tiles' outside slots.

@@ -465,7 +465,7 @@ fn a_graph_that_can_not_be_computed_is_refused() {
 #[test]
 fn a_spring_is_as_stiff_from_either_end_however_heavy_its_ends_are() {
     let model = Model::gallbladder(&[]);
-    let graph = model.graph.as_ref().unwrap();
+    let graph = model.places.surface().unwrap();
     let (mut springs, mut uneven) = (0, 0);
     for slot in model.points().map(|point| graph.slot_of(point)) {
         for (other, rest, stiffness) in graph.joined(slot) {

@@ -33,7 +33,7 @@ impl<T: Real> TissueState<T> {
 
     /// Returns the energy of the pressure, J.
     pub(crate) fn pressure_j(&self, volume_change: f64) -> f64 {
-        let Some(volume) = self.model.graph.as_ref().and_then(|graph| graph.volume.as_ref()) else { return 0.0 };
+        let Some(volume) = self.model.places.volume() else { return 0.0 };
         let unit_m = self.model.unit_m;
         0.5 * self.model.scene.volume_stiffness_pa * volume.stretch_m * (volume_change * unit_m).powi(2)
     }
@@ -42,7 +42,7 @@ impl<T: Real> TissueState<T> {
     /// force of anchor springs.
     pub(crate) fn wake_what_is_pressed(&mut self, volume_change: f64, far: f64) {
         let TissueState { model, tiles, .. } = self;
-        let Some(graph) = &model.graph else { return };
+        let Some(graph) = model.places.surface() else { return };
         let Some(volume) = &graph.volume else { return };
         let scene = &model.scene;
         let stiffness = scene.volume_stiffness_pa * volume.stretch_m;

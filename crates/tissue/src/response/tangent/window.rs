@@ -2,8 +2,8 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::body::Places;
 use crate::body::footprint::Footprint;
-use crate::body::surface::MeshPlaces;
 use crate::model::Model;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
@@ -58,9 +58,9 @@ impl Window {
     /// Returns the window around a place of the rest surface; on a mesh, the radius shrinks until it has at
     /// most `most` points.
     pub(super) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
-        match &model.graph {
-            None => Self::of_sheet(model, radius_m, centre_m.truncate()),
-            Some(graph) => {
+        match &model.places {
+            Places::Sheet(_) => Self::of_sheet(model, radius_m, centre_m.truncate()),
+            Places::Surface(_) => {
                 let shape = model.shape();
                 let mut within_m = half_window_m(model, radius_m).min(2.0 * shape.longest_side_m());
                 let mut points = shape.around(centre_m, within_m);
@@ -68,7 +68,7 @@ impl Window {
                     within_m *= 0.9;
                     points = shape.around(centre_m, within_m);
                 }
-                let mut slots: Vec<usize> = points.into_iter().map(|point| graph.slot_of(point)).collect();
+                let mut slots: Vec<usize> = points.into_iter().map(|point| model.place_of(point)).collect();
                 slots.sort_unstable();
                 Window::Ball(slots)
             }
@@ -140,14 +140,14 @@ impl Window {
     /// held.
     pub(super) fn free(&self, model: &Model) -> Vec<bool> {
         let is_fixed = |index: usize| model.fixed.binary_search(&index).is_ok();
-        match (self, &model.graph) {
-            (Window::Ball(slots), Some(graph)) => {
+        match self {
+            Window::Ball(slots) => {
                 let is_within = |slot: usize| slots.binary_search(&slot).is_ok();
                 let is_free =
-                    |slot: &usize| !is_fixed(*slot) && graph.joined(*slot).all(|(other, ..)| is_within(other));
+                    |slot: &usize| !is_fixed(*slot) && model.places.joined(*slot).all(|(other, ..)| is_within(other));
                 slots.iter().map(is_free).collect()
             }
-            (Window::Grid { origin, size }, _) => {
+            Window::Grid { origin, size } => {
                 let layers = if model.scene.springs.bending { 2 } else { 1 };
                 let inside = |axis: usize, place: usize| {
                     (origin[axis] == 0 || place >= layers)
@@ -156,17 +156,15 @@ impl Window {
                 let is_free = |(at, index)| inside(0, at / size[1]) && inside(1, at % size[1]) && !is_fixed(index);
                 self.points(model).enumerate().map(is_free).collect()
             }
-            (Window::Ball(_), None) => Vec::new(),
         }
     }
 
     /// Returns the springs that join points of the window, at least one of which is `free`. Rest vectors are
     /// turned by `turn`.
     pub(super) fn springs(&self, model: &Model, free: &[bool], turn: &DMat3) -> Vec<Spring> {
-        let mut springs = match (self, &model.graph) {
-            (Window::Ball(slots), Some(graph)) => of_mesh(model, graph, slots, free),
-            (Window::Grid { size, .. }, _) => of_grid(model, *size, free),
-            (Window::Ball(_), None) => Vec::new(),
+        let mut springs = match self {
+            Window::Ball(slots) => of_mesh(model, slots, free),
+            Window::Grid { size, .. } => of_grid(model, *size, free),
         };
         springs.iter_mut().for_each(|spring| spring.rest_m = *turn * spring.rest_m);
         springs
@@ -203,10 +201,10 @@ fn of_grid(model: &Model, size: [usize; 2], free: &[bool]) -> Vec<Spring> {
     found
 }
 
-fn of_mesh(model: &Model, graph: &MeshPlaces, slots: &[usize], free: &[bool]) -> Vec<Spring> {
+fn of_mesh(model: &Model, slots: &[usize], free: &[bool]) -> Vec<Spring> {
     let mut found = Vec::new();
     for (one, slot) in slots.iter().enumerate() {
-        for (other, rest, stiffness) in graph.joined(*slot).filter(|(other, ..)| other > slot) {
+        for (other, rest, stiffness) in model.places.joined(*slot).filter(|(other, ..)| other > slot) {
             let Ok(other) = slots.binary_search(&other) else { continue };
             if free[one] || free[other] {
                 let stiffness_n_per_m = model.scene.springs.stiffness_n_per_m * stiffness;

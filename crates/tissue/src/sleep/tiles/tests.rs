@@ -5,6 +5,7 @@ use glam::DVec3;
 
 use super::*;
 use crate::Model;
+use crate::body::sheet::tiles::SheetTiles;
 use crate::scene::profile::Poke;
 use crate::tools::applied_force::{Applied, Push};
 
@@ -15,9 +16,14 @@ fn layout() -> Layout {
     Layout::new::<f64>(POINTS)
 }
 
+fn asleep<T: Real>(tolerance: f64) -> SleepTiles<T> {
+    let graph = TileGraph::Sheet(SheetTiles::new(layout(), 1));
+    SleepTiles::asleep(layout(), tolerance, 1, graph, POINTS[0] * POINTS[1])
+}
+
 /// All asleep.
 fn tiles() -> SleepTiles<f64> {
-    SleepTiles::asleep(layout(), 1e-3, 1, (None, POINTS[0] * POINTS[1]))
+    asleep(1e-3)
 }
 
 fn offset(c: usize, [i, j]: [usize; 2]) -> usize {
@@ -32,29 +38,19 @@ fn points() -> impl Iterator<Item = [usize; 2]> {
 #[test]
 fn each_point_is_in_one_tile_and_wakes_that_alone() {
     let all = tiles();
-    let sizes: Vec<usize> = (0..9).map(|tile| all.rows(tile).len() * all.columns(tile).len()).collect();
+    let sizes: Vec<usize> =
+        (0..9).map(|tile| sides_of(&layout(), tile).iter().map(ExactSizeIterator::len).product()).collect();
     assert_eq!(sizes.iter().sum::<usize>(), POINTS[0] * POINTS[1]);
     for [i, j] in points() {
         let tile = all.of([i, j]);
-        assert!(all.rows(tile).contains(&i) && all.columns(tile).contains(&j), "{i} {j}");
+        let [rows, columns] = sides_of(&layout(), tile);
+        assert!(rows.contains(&i) && columns.contains(&j), "{i} {j}");
     }
     for [i, j] in points().step_by(61) {
         let (mut tiles, tile) = (tiles(), all.of([i, j]));
         tiles.wake_under([[i, j]]);
         assert_eq!((tiles.region.tiles(), tiles.awake_points), (&[tile][..], sizes[tile]), "{i} {j}");
     }
-}
-
-#[test]
-fn neighbours_are_the_tiles_around_that_are_on_the_sheet() {
-    let tiles = tiles();
-    let around: Vec<Vec<usize>> =
-        (0..9).map(|tile| (0..NEIGHBOURS.len()).filter_map(|side| tiles.neighbour(tile, side)).collect()).collect();
-    assert_eq!(around[0], [1, 3, 4]);
-    assert_eq!(around[1], [0, 2, 3, 4, 5]);
-    assert_eq!(around[MIDDLE], [0, 1, 2, 3, 5, 6, 7, 8]);
-    assert_eq!(around[5], [1, 2, 4, 7, 8]);
-    assert_eq!(around[8], [4, 5, 7]);
 }
 
 #[test]
@@ -92,7 +88,7 @@ fn a_movement_at_an_end_or_in_the_middle_of_a_tile_is_seen() {
     let (zero, mut moved) = (Field::zero(&layout()), Field::zero(&layout()));
     let all: Vec<usize> = (0..9).collect();
     for tile in 0..9 {
-        let sides = [tiles().rows(tile), tiles().columns(tile)];
+        let sides = sides_of(&layout(), tile);
         let [rows, columns] = sides.map(|side| [side.start, side.start + side.len() / 2, side.end - 1]);
         for (n, point) in rows.into_iter().flat_map(|i| columns.map(|j| [i, j])).enumerate() {
             let (mut tiles, at) = (tiles(), offset(n % 3, point));
@@ -162,7 +158,8 @@ fn a_tile_drifts_by_the_force_on_its_nearest_point() {
         tiles.pushed(&change, spacing_m, 1e3);
     }
     for tile in [4, 5, 7, 8] {
-        let points = tiles.rows(tile).flat_map(|i| tiles.columns(tile).map(move |j| place(i as f64, j as f64)));
+        let [rows, columns] = sides_of(&layout(), tile);
+        let points = rows.flat_map(|i| columns.clone().map(move |j| place(i as f64, j as f64)));
         let nearest_m = points.map(|point_m| point_m.distance(centre_m)).fold(f64::INFINITY, f64::min);
         let expected_n = (-falloff_per_m * nearest_m).exp();
         assert!((tiles.drift_n[tile] - expected_n).abs() < 1e-9, "{tile}: {} N {expected_n}", tiles.drift_n[tile]);
@@ -172,7 +169,7 @@ fn a_tile_drifts_by_the_force_on_its_nearest_point() {
 #[test]
 fn without_anchor_springs_even_a_difference_in_the_last_digit_is_noticed() {
     let model = |stiffness: f64| Model::paper(&[&format!("anchor_springs.stiffness_n_per_m={stiffness:?}")]);
-    let mut tiles = SleepTiles::<f32>::asleep(layout(), 1e-12, 1, (None, POINTS[0] * POINTS[1]));
+    let mut tiles = asleep::<f32>(1e-12);
     tiles.largest = 2.0;
     let last_digit = 2.0 * <f32 as Real>::EPSILON;
     assert_eq!(tiles.wake_threshold(&model(5.0).scene), last_digit);
