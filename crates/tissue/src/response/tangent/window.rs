@@ -148,7 +148,7 @@ impl Window {
                 slots.iter().map(is_free).collect()
             }
             Window::Grid { origin, size } => {
-                let layers = if model.scene.springs.bending { 2 } else { 1 };
+                let layers = model.spring_rows();
                 let inside = |axis: usize, place: usize| {
                     (origin[axis] == 0 || place >= layers)
                         && (origin[axis] + size[axis] == model.points[axis] || place + layers < size[axis])
