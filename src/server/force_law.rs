@@ -146,8 +146,8 @@ impl Maker {
         let place_m = place_m.filter(|_| known.has_places || is_other);
         let disc = place_m.map_or(known.disc, |place_m| known.disc.follow(model, place_m));
         if is_other || disc != known.disc {
-            // The coarse law of a sheet is computed in its middle.
-            let is_exact = !is_other && model.shape().dimensions() == 2;
+            // The coarse law of a uniform tissue is computed in its middle.
+            let is_exact = !is_other && model.shape().is_uniform();
             let law = if is_exact { self.exact(model, disc).await } else { self.first(model, disc).await };
             let (is_coarse, has_places) = (law.as_ref().is_ok_and(|law| law.is_coarse), !is_exact || law.is_ok());
             self.say(known, is_other.then_some(step), law, tell).await;
@@ -155,7 +155,7 @@ impl Maker {
         }
         if known.is_coarse {
             let law = self.exact(model, disc).await;
-            known.has_places = law.is_ok() || model.shape().dimensions() > 2;
+            known.has_places = law.is_ok() || !model.shape().is_uniform();
             self.say(known, None, law, tell).await;
             known.is_coarse = false;
         }

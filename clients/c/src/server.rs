@@ -12,8 +12,8 @@ use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use palpate_refusal::Refusal;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::sent::{self, MeshFile, mesh_file};
-use palpate_tissue::scene::{Body, Scene};
 use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 
@@ -271,7 +271,7 @@ fn create_own(
     said: Option<MeshFile>,
 ) -> Result<*mut palpate_session, CodedError> {
     let mut message = ::palpate_session::wire::scene::sent(scene);
-    if let (Body::Mesh(mesh), Some(of_scene)) = (&scene.body, &mut message.mesh) {
+    if let Some((mesh, of_scene)) = scene.mesh().zip(message.mesh.as_mut()) {
         // The number of vertices as requested in the file; the mesh may have fewer.
         let vertices = said.and_then(|said| said.vertices);
         of_scene.vertices = vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));

@@ -9,7 +9,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::collection::{Collection, find_scene, find_script};
 use palpate_tissue::scene::kind::TextKind;
-use palpate_tissue::scene::{self, Body, Named};
+use palpate_tissue::scene::{self, Named};
 use palpate_tissue::shape::{PointId, PointName};
 use palpate_tissue::state::saved::SavedPlan;
 use pyo3::prelude::*;
@@ -348,7 +348,7 @@ impl Tissue {
     /// Number of points along x and y of a sheet, as in rest_m.reshape(*grid, 3); None for a mesh.
     #[getter]
     fn grid(&self) -> Option<(usize, usize)> {
-        self.model.scene.sheet().map(|sheet| (sheet.points[0], sheet.points[1]))
+        self.model.shape().grid().map(|[x, y]| (x, y))
     }
 
     /// The position of each point at rest, m.
@@ -382,18 +382,8 @@ impl Tissue {
 
     /// The triangles of the surface, each with the rows of its three points, counter-clockwise from outside.
     #[getter]
-    #[allow(clippy::cast_possible_truncation)]
     fn triangles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let corners: Vec<u32> = match &self.model.scene.body {
-            Body::Mesh(mesh) => mesh.shape.triangles().iter().flatten().copied().collect(),
-            Body::Sheet(sheet) => {
-                let [nx, ny] = sheet.points.map(|points| points as u32);
-                let cells = (0..nx.saturating_sub(1)).flat_map(|i| (0..ny.saturating_sub(1)).map(move |j| i * ny + j));
-                // Counter-clockwise from above.
-                cells.flat_map(|at| [at, at + ny, at + ny + 1, at, at + ny + 1, at + 1]).collect()
-            }
-        };
-        shaped(py, corners, &[3])
+        shaped(py, self.model.shape().triangles().into_flattened(), &[3])
     }
 
     /// Returns the row of a point: (i, j) on a sheet, the number of a vertex on a mesh.

@@ -7,7 +7,6 @@ use palpate_client::upload::upload_mesh;
 use palpate_proto::pb;
 use palpate_refusal::{Reason, Refusal};
 use palpate_session::wire;
-use palpate_tissue::scene::Body;
 use palpate_tissue::scene::sent::{self, mesh_file};
 use pb::create_session_request::Source;
 use pyo3::PyResult;
@@ -30,7 +29,7 @@ impl SessionSource {
     /// Converts a scene that was read here.
     pub(crate) fn of(scene: &Scene) -> Result<Self, Refusal> {
         let mut message = Box::new(wire::scene::sent(&scene.scene));
-        let Body::Mesh(mesh) = &scene.scene.body else {
+        let Some(mesh) = scene.scene.mesh() else {
             return Ok(SessionSource::Scene { scene: message, mesh: None });
         };
         let file = Path::new(&scene.place);

@@ -11,8 +11,8 @@ use palpate_refusal::Refusal;
 use palpate_session::wire;
 use palpate_tissue::files;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::sent::{self, mesh_file};
-use palpate_tissue::scene::{Body, Scene};
 use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
@@ -46,9 +46,9 @@ impl SceneFile {
         let limits = Limits::default();
         let own = Scene::load(file, &[], &limits)?;
         let mut message = wire::scene::sent(&own);
-        let mesh = match &own.body {
-            Body::Sheet(_) => None,
-            Body::Mesh(mesh) => {
+        let mesh = match own.mesh() {
+            None => None,
+            Some(mesh) => {
                 let said = mesh_file(file, &limits)?.unwrap_or_default();
                 if let Some(told) = &mut message.mesh {
                     told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));

@@ -19,7 +19,6 @@ pub mod budget;
 pub mod check;
 pub mod command;
 pub mod current_laws;
-mod indentation;
 pub mod input;
 pub mod intake;
 pub mod intake_transfer;
@@ -37,7 +36,6 @@ pub mod simulation;
 pub mod snapshot;
 pub mod surface;
 pub mod tissue_copy;
-mod tool_depth;
 pub mod wire;
 
 use std::sync::Arc;

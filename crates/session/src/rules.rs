@@ -1,7 +1,5 @@
 //! The rules for a command that do not depend on when it comes, so it can be checked without locking the intake.
 
-use palpate_geometry::surface::SurfaceDisc;
-
 use super::command::Command;
 use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
@@ -99,13 +97,9 @@ fn check_played_by_time(command: &Command) -> Result<()> {
 }
 
 /// Returns how many triangles a tip makes a session look up in a step of `substeps` substeps: its disc is laid out
-/// twice in each. A disc on a sheet has bounded cost however large it is (`palpate_tissue::footprint`), and counts
-/// as 0.
+/// twice in each ([`RestShape::disc_work`]).
 fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
-    if shape.dimensions() < 3 {
-        return 0;
-    }
-    SurfaceDisc::crossings(radius_m, shape.edge_m()).saturating_mul(2 * u64::from(substeps))
+    shape.disc_work(radius_m).saturating_mul(2 * u64::from(substeps))
 }
 
 /// Refuses a tip of radius `now_m` that would make a step too long for the other sessions of its thread. `tips_m`

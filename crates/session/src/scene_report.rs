@@ -7,14 +7,13 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use palpate_haptics::{Coupling, Law, Tip};
 
-use super::{indentation, tool_depth};
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
+use palpate_tissue::scene::BodyKind;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::scene::{Body, BodyKind};
 use palpate_tissue::scheme::Oscillator;
-use palpate_tissue::shape::{Extent, RestShape};
+use palpate_tissue::shape::{Deepest, RestShape};
 
 /// Bounds of plausible values. Beyond them a unit is probably wrong.
 const LONGEST_SIDE_M: f64 = 10.0;
@@ -170,8 +169,10 @@ impl Prospect {
                  were larger"
             ));
         }
-        if shorter_m(self.size_m) < 2.0 * self.radius_m && shape.dimensions() == 2 {
-            doubts.push(format!("a fingertip, {} across, is wider than the sheet", length(2.0 * self.radius_m)));
+        let reaches_rim = |side: DVec3| shape.beyond_rim_m(shape.extent().middle_m() + self.radius_m * side) > 0.0;
+        if reaches_rim(DVec3::X) || reaches_rim(DVec3::Y) {
+            let (across, what) = (length(2.0 * self.radius_m), kind.section());
+            doubts.push(format!("a fingertip, {across} across, is wider than the {what}"));
         }
         let [least, most] = STIFFNESS_N_PER_M;
         if let Some(stiffness) = self.stiffness_n_per_m().filter(|stiffness| !(least..=most).contains(stiffness)) {
@@ -232,20 +233,23 @@ fn rest_s(sheet: &Oscillator) -> Result<f64, &'static str> {
     Ok(-AT_REST.ln() / slowest_per_s)
 }
 
-/// Returns the depth of each force of a script. On a sheet, a disc with the area of the falloff presses with the
-/// whole force in the middle; beyond the law's reach the force continues linearly. On a mesh, the force acts where
-/// it begins (`indentation.rs`).
+/// Returns the depth of each force of a script. On a uniform tissue, a disc with the area of the falloff presses with
+/// the whole force in the middle; beyond the law's reach the force continues linearly. On others, the force acts where
+/// it begins ([`BodyKind::indentation_m`]).
 fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
     let shape = model.shape();
     let force = |profile: &LoadProfile| {
         let total_n = total_n(shape, profile);
         let longest_m = shape.longest_side_m();
-        if let Body::Mesh(mesh) = &model.scene.body {
+        if !shape.is_uniform() {
             let (centre_m, factor) = (profile.centre.begins_at_m(), profile.falloff_offset);
             let (falloff_per_m, force_n) = (profile.falloff_per_m, largest_n(profile));
             let poke = Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: factor };
-            let through_m = indentation::thickness_m(mesh, shape.nearest(centre_m)).unwrap_or(longest_m);
-            return Force { total_n, depth_m: indentation::depth_m(&model.scene, &poke), through_m };
+            let (scene, kind) = (&model.scene, model.scene.body.kind());
+            let (anchor_n_per_m, volume_pa) = (scene.anchor_stiffness_n_per_m, scene.volume_stiffness_pa);
+            let depth_m = kind.indentation_m(&scene.springs, anchor_n_per_m, volume_pa, &poke);
+            let through_m = kind.thickness_m(shape.nearest(centre_m)).unwrap_or(longest_m);
+            return Force { total_n, depth_m, through_m };
         }
         let widest_m = 0.5 * longest_m;
         // ∫ exp(−c·r) over the plane is the area of a disc of this radius.
@@ -272,26 +276,18 @@ fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut 
     let reached = profile.poses.iter().take_while(|pose| pose.0 <= end_s).map(|pose| pose.1);
     let way: Vec<DVec3> = reached.chain(endless.at(end_s)).collect();
     // A disc meets the tissue while its edge is over it.
-    let Extent { least_m, most_m } = shape.extent();
-    let (tip, radius_m) = (profile.tip, DVec3::splat(profile.tip.radius_m));
-    let over = |pair: &[DVec3]| part_within(pair[0], pair[1], least_m - radius_m, most_m + radius_m);
+    let (tip, extent) = (profile.tip, shape.extent());
+    let over = |pair: &[DVec3]| extent.part_beneath_m([pair[0], pair[1]], tip.radius_m);
     let Some(begin) = way.windows(2).position(|pair| over(pair).is_some()) else {
         return if way.is_empty() { Meeting::Unused } else { Meeting::Beside };
     };
-    let mut parts = way[begin..].windows(2).filter_map(over).flatten();
     if tip.grasps {
-        let held_m = parts.next().unwrap_or(way[begin]);
+        let held_m = over(&way[begin..]).map_or(way[begin], |[from_m, _]| from_m);
         let moved_m = way[begin + 1..].iter().map(|place_m| place_m.distance(held_m)).fold(0.0, f64::max);
         return Meeting::Held { moved_m };
     }
-    let middle = Disc::in_middle(laws.model, tip.radius_m);
-    let (depth_m, disc) = if let Body::Mesh(mesh) = &laws.model.scene.body {
-        let Some(found) = tool_depth::deepest(mesh.shape.surface(), &way, tip.radius_m) else { return Meeting::Beside };
-        (found.depth_m, middle.follow(laws.model, found.rest_m))
-    } else {
-        let lowest_m = parts.map(|place_m| place_m.z).fold(f64::INFINITY, f64::min);
-        (most_m.z - lowest_m, middle)
-    };
+    let Some(Deepest { depth_m, rest_m }) = shape.deepest(&way, tip.radius_m) else { return Meeting::Beside };
+    let disc = Disc::in_middle(laws.model, tip.radius_m).follow(laws.model, rest_m);
     if depth_m <= 0.0 {
         return Meeting::Above { gap_m: -depth_m };
     }
@@ -303,23 +299,6 @@ fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut 
             Meeting::Pressed { depth_m, force_n, is_bound: true }
         }
     }
-}
-
-/// Returns the ends of the part of a straight path whose x and y are within a box; `None` if no part is.
-fn part_within(from_m: DVec3, to_m: DVec3, least_m: DVec3, most_m: DVec3) -> Option<[DVec3; 2]> {
-    let (mut begin, mut end) = (0.0_f64, 1.0_f64);
-    for c in 0..2 {
-        let way_m = to_m[c] - from_m[c];
-        if way_m == 0.0 {
-            if !(least_m[c]..=most_m[c]).contains(&from_m[c]) {
-                return None;
-            }
-            continue;
-        }
-        let [a, b] = [least_m[c], most_m[c]].map(|edge_m| (edge_m - from_m[c]) / way_m);
-        (begin, end) = (begin.max(a.min(b)), end.min(a.max(b)));
-    }
-    (begin <= end).then(|| [from_m.lerp(to_m, begin), from_m.lerp(to_m, end)])
 }
 
 /// Returns the largest force of a profile on all points together, N.
@@ -621,7 +600,7 @@ mod tests {
                     thickness_m = 0.003\nfoundation_n_per_m3 = 5e5\n[stepping]\nsubsteps = 8\n";
         let scene = Scene::parse("test", text, &[], &Limits::default()).unwrap();
         let model = Model::compile(&scene, &Limits::default()).unwrap();
-        let Body::Mesh(mesh) = &model.scene.body else { panic!("of another kind") };
+        let mesh = model.scene.mesh().unwrap();
         let point = mesh.shape.nearest(DVec3::new(0.02, 0.0, -0.05));
         let (at_m, force_n) = (mesh.shape.rest_m(point), -100.0 * mesh.shape.normal(point));
         let script = format!(
@@ -632,7 +611,7 @@ mod tests {
         );
         let script = Script::parse("test", &script, Path::new(""), &model.scene, &Limits::default()).unwrap();
         let warnings = Prospect::new(&model, Some(&script)).warnings;
-        let thick = length(indentation::thickness_m(mesh, point).unwrap());
+        let thick = length(mesh.thickness_m(point).unwrap());
         let named = format!("more than the {thick} that it is thick there: it goes through");
         assert!(warnings.iter().any(|warning| warning.ends_with(&named)), "{named}: {warnings:?}");
     }

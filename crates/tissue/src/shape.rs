@@ -5,7 +5,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use serde::Serialize;
 
 use palpate_refusal::{Reason, Refusal, Result, finite, legible};
@@ -83,6 +83,30 @@ impl Extent {
         (self.least_m + self.most_m) / 2.0
     }
 
+    /// Returns how far a place is beside the box along x and along y, m; 0 within it.
+    pub fn beside_m(&self, place_m: DVec3) -> DVec2 {
+        (self.least_m - place_m).max(place_m - self.most_m).max(DVec3::ZERO).truncate()
+    }
+
+    /// Returns the ends of the part of a straight path whose x and y are within the box, or within `margin_m` of it, m;
+    /// `None` if no part is.
+    pub fn part_beneath_m(&self, [from_m, to_m]: [DVec3; 2], margin_m: f64) -> Option<[DVec3; 2]> {
+        let (mut begin, mut end) = (0.0_f64, 1.0_f64);
+        for c in 0..2 {
+            let (least_m, most_m) = (self.least_m[c] - margin_m, self.most_m[c] + margin_m);
+            let way_m = to_m[c] - from_m[c];
+            if way_m == 0.0 {
+                if !(least_m..=most_m).contains(&from_m[c]) {
+                    return None;
+                }
+                continue;
+            }
+            let [a, b] = [least_m, most_m].map(|edge_m| (edge_m - from_m[c]) / way_m);
+            (begin, end) = (begin.max(a.min(b)), end.min(a.max(b)));
+        }
+        (begin <= end).then(|| [from_m.lerp(to_m, begin), from_m.lerp(to_m, end)])
+    }
+
     /// Returns the length of the box along each axis, m.
     pub fn size_m(&self) -> DVec3 {
         self.most_m - self.least_m
@@ -94,6 +118,15 @@ impl fmt::Display for Extent {
         let [x, y, z] = self.size_m().to_array().map(legible);
         if z > 0.0 { write!(f, "{x} m × {y} m × {z} m") } else { write!(f, "{x} m × {y} m") }
     }
+}
+
+/// The deepest place of a tip's path ([`RestShape::deepest`]).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Deepest {
+    /// Depth below the surface, on the side where the tip did not begin, m; negative if it stays away.
+    pub depth_m: f64,
+    /// The place of the tissue at rest that the tip presses there, m.
+    pub rest_m: DVec3,
 }
 
 /// The rest shape of a tissue: its points, in the tissue's frame (the axes of the scene or mesh file, m).
@@ -164,6 +197,83 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     /// Returns how many numbers give a place: 3, or 2 if the whole shape rests in the plane z = 0.
     fn dimensions(&self) -> usize {
         3
+    }
+
+    /// Returns the place in space of a place `[x, y]`, m, in the plane in which the whole shape rests.
+    ///
+    /// # Errors
+    /// Refuses it if the shape does not rest in the plane z = 0 ([`Reason::WrongKind`]); `field` is the key that the
+    /// refusal gives.
+    fn in_plane_m(&self, field: &str, _place_m: DVec2) -> Result<DVec3> {
+        let message = "is a place in the plane of a sheet; on a mesh give `vertex`, or `at_m`, a place in space";
+        Err(Refusal::new(Reason::WrongKind, field, message))
+    }
+
+    /// Returns the key that names a point in scripts and messages, `"point"` or `"vertex"`.
+    fn point_key(&self) -> &'static str {
+        match self.name(PointId(0)) {
+            PointName::Point(_) => "point",
+            PointName::Vertex(_) => "vertex",
+        }
+    }
+
+    /// Returns the points along x and y, if the points are a grid numbered row by row (index i·ny + j).
+    fn grid(&self) -> Option<[usize; 2]> {
+        None
+    }
+
+    /// Returns the triangles of the surface, each by its corners ([`PointId::index`]), counter-clockwise from outside.
+    fn triangles(&self) -> Vec<[u32; 3]>;
+
+    /// Returns the number of vertices that frames show without refinement: the points, or the vertices of the file if
+    /// the tissue is simulated more coarsely than that.
+    fn shown_count(&self) -> usize {
+        self.point_count()
+    }
+
+    /// Returns whether the tissue is the same everywhere but near its rim and its listed fixed points, so that one
+    /// place can represent the others ([`RestShape::representative_m`]).
+    fn is_uniform(&self) -> bool {
+        false
+    }
+
+    /// Returns a place at rest, m, where a disc of `radius_m` (m) meets the tissue in the same way as at `place_m` (m),
+    /// if a disc is noticed `noticed_m` (m) away from its middle. By default it is the point nearest to
+    /// `place_m`.
+    fn representative_m(&self, _radius_m: f64, _noticed_m: f64, place_m: DVec3) -> DVec3 {
+        self.rest_m(self.nearest(place_m))
+    }
+
+    /// Returns the value of the surface at a place, m, from the values of points: that of the nearest point, or one
+    /// interpolated between the points around the place.
+    fn interpolate(&self, place_m: DVec3, value: &dyn Fn(PointId) -> DVec3) -> DVec3 {
+        value(self.nearest(place_m))
+    }
+
+    /// Returns the deepest place of the path of a tip of `radius_m` (m) along `way_m` (m) in the tissue at rest; `None`
+    /// if the tip is beside the tissue all the time.
+    fn deepest(&self, way_m: &[DVec3], radius_m: f64) -> Option<Deepest>;
+
+    /// Returns how far a place is beyond the rim at which the shape ends, m; 0 within it, and for a shape without a
+    /// rim. A tip that touches there drags the rim along.
+    fn beyond_rim_m(&self, _place_m: DVec3) -> f64 {
+        0.0
+    }
+
+    /// Returns the largest radius of a tip, m, with the reason for it.
+    fn most_tip_radius_m(&self) -> (f64, &'static str) {
+        (self.longest_side_m(), "the longest side of the tissue")
+    }
+
+    /// Returns how many triangles are looked up to lay out a disc of `radius_m` (m) once; 0 if the cost of a disc has a
+    /// bound, however large it is.
+    fn disc_work(&self, _radius_m: f64) -> u64 {
+        0
+    }
+
+    /// Returns whether the normal of every point is +z, so that z alone tells how far a point was pressed.
+    fn faces_up(&self) -> bool {
+        false
     }
 
     /// Returns the longest side of the box around the shape, or [`RestShape::edge_m`] if that is longer, m.

@@ -275,7 +275,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
         changed(&model, at_s, factor)
     });
     let change = change.transpose()?;
-    let usual = if model.shape().dimensions() > 2 { Rendering::Prediction } else { Rendering::Model };
+    let usual = if model.shape().is_uniform() { Rendering::Model } else { Rendering::Prediction };
     let (scheme, seed) = (arguments.scheme.unwrap_or(usual), arguments.seed);
     Ok(Setup {
         model,

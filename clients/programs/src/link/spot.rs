@@ -17,9 +17,6 @@ pub(super) struct Spot {
 impl Spot {
     /// Returns the place of the rest surface that is nearest to `near_m`, for a disc of `radius_m`.
     pub(super) fn new(model: &Model, near_m: DVec3, radius_m: f64) -> Self {
-        if model.shape().dimensions() == 2 {
-            return Spot { at_m: near_m, turn: DMat3::IDENTITY };
-        }
         let (at_m, outward) = Footprint::new(model, radius_m, near_m).at_rest();
         Spot { at_m, turn: DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z)) }
     }

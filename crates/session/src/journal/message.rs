@@ -21,7 +21,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
-use palpate_tissue::scene::{Appearance, Body, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
+use palpate_tissue::scene::{Appearance, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::state::saved::{CorrectedPlan, SavedPlan};
 
@@ -94,10 +94,7 @@ fn from_mesh(message: &pb::TriangleMesh, limits: &Limits) -> Result<TriangleMesh
 
 /// Returns the scene with which a session began, as three parts of a header.
 pub(super) fn scene(scene: &Scene) -> (palpate_proto::pb::Scene, Option<pb::TriangleMesh>, pb::Appearance) {
-    let mesh = match &scene.body {
-        Body::Mesh(of_mesh) => Some(mesh(&of_mesh.shape)),
-        Body::Sheet(_) => None,
-    };
+    let mesh = scene.mesh().map(|of_mesh| mesh(&of_mesh.shape));
     let Appearance { texture, surface, texture_seed, texture_size } = &scene.appearance;
     let appearance = pb::Appearance {
         texture: texture.as_ref().map(|path| path.display().to_string()).unwrap_or_default(),

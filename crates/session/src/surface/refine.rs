@@ -9,8 +9,8 @@ use super::wide::{Available, LANES, SixteenLanes};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
-use palpate_tissue::scene::{Body, Scene, Sheet};
-use palpate_tissue::shape::{PointId, RestShape};
+use palpate_tissue::scene::Scene;
+use palpate_tissue::shape::PointId;
 
 /// Name of the buffers in messages.
 const ROW: &str = "a row of a frame";
@@ -29,13 +29,8 @@ pub const MESH_ROW: usize = 16;
 /// vertices of a mesh are in rows, in an order that keeps neighbours together; the last row may have places without
 /// a vertex.
 pub(super) fn grid(scene: &Scene) -> ([usize; 2], f64) {
-    match &scene.body {
-        Body::Sheet(Sheet { points, spacing_m, .. }) => (*points, *spacing_m),
-        Body::Mesh(mesh) => {
-            let shown = mesh.shape.shown().map_or(mesh.shape.point_count(), |shown| shown.places.len());
-            ([shown.div_ceil(MESH_ROW), MESH_ROW], mesh.shape.edge_m())
-        }
-    }
+    let shape = scene.shape();
+    (shape.grid().unwrap_or_else(|| [shape.shown_count().div_ceil(MESH_ROW), MESH_ROW]), shape.edge_m())
 }
 
 /// Grid of a frame: nx × ny vertices, of which vertex [i, j] has the number i·ny + j. For a sheet these are its

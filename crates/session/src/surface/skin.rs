@@ -8,7 +8,7 @@ use palpate_geometry::Group;
 
 use palpate_tissue::Model;
 use palpate_tissue::memory;
-use palpate_tissue::scene::{Body, BoundPlace, MeshShape};
+use palpate_tissue::scene::{BoundPlace, MeshShape};
 use palpate_tissue::shape::RestShape;
 
 /// Name of the skin's tables in messages.
@@ -43,7 +43,7 @@ impl Skin {
     /// Creates the skin of a tissue on a mesh; `None` for a sheet. It unwinds with a refusal if there is no memory
     /// for its tables (`palpate_tissue::memory`).
     pub fn of(model: &Model) -> Option<Arc<Self>> {
-        let (Body::Mesh(mesh), Some([order, slot_of])) = (&model.scene.body, model.shown_order()) else { return None };
+        let (mesh, [order, slot_of]) = model.scene.mesh().zip(model.shown_order())?;
         let shape = mesh.shape.clone();
         let Some(shown) = shape.shown() else {
             let (vertices, places) = (order.to_vec(), slot_of.to_vec());

@@ -1,6 +1,6 @@
 //! Conversion of commands from and to messages.
 
-use glam::{DQuat, DVec2, DVec3};
+use glam::{DQuat, DVec3};
 use palpate_haptics::Tip;
 use palpate_proto::geometry::{from_place, from_vector, vector};
 use palpate_proto::pb;
@@ -35,7 +35,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
                         shape.find("force.vertex", required("force.vertex", from_point(None, Some(*vertex)))?)?;
                     (Some(point), shape.rest_m(point))
                 }
-                pb::force::Centre::CentreM(place) => (None, on_sheet(shape, from_place(place))?),
+                pb::force::Centre::CentreM(place) => (None, shape.in_plane_m("force.centre_m", from_place(place))?),
                 pb::force::Centre::AtM(place) => (None, at(shape, from_vector(Some(place)))?),
             };
             let force_n = from_vector(force.force_n.as_ref());
@@ -70,15 +70,6 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
     })
 }
 
-/// Returns the place of a force in the rest plane of a sheet, m.
-fn on_sheet(shape: &dyn RestShape, place_m: DVec2) -> Result<DVec3> {
-    if shape.dimensions() > 2 {
-        let message = "is a place in the plane of a sheet; on a mesh give `vertex`, or `at_m`, a place in space";
-        return Err(Refusal::new(Reason::WrongKind, "force.centre_m", message));
-    }
-    Ok(place_m.extend(0.0))
-}
-
 /// Returns the place of a force in space, m; on a sheet, the nearest one in its rest plane.
 fn at(shape: &dyn RestShape, place_m: DVec3) -> Result<DVec3> {
     shape.check_place("force.at_m", place_m)?;
@@ -92,12 +83,13 @@ fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
         let message = "does not go with `position.point`: a tool grasps a point of a sheet or a vertex of a mesh";
         return Err(Refusal::new(Reason::WrongKind, "position.vertex", message));
     }
-    let field = match (vertex, shape.dimensions()) {
-        (Some(_), _) => "position.vertex",
-        (None, 3) if point.is_none() => "position.vertex",
-        _ => "position.point",
+    let key = match (point, vertex) {
+        (Some(_), _) => "point",
+        (None, Some(_)) => "vertex",
+        (None, None) => shape.point_key(),
     };
-    shape.find(field, required(field, from_point(point, vertex))?)
+    let field = format!("position.{key}");
+    shape.find(&field, required(&field, from_point(point, vertex))?)
 }
 
 /// Returns the position of a pose's tip, m: the position plus the turned offset of the tip.

@@ -6,6 +6,7 @@ pub(crate) mod sheet;
 pub mod surface;
 pub(crate) mod tables;
 pub(crate) mod tile_graph;
+pub mod window;
 
 use std::ops::Range;
 use std::sync::Arc;

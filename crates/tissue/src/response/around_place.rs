@@ -17,22 +17,13 @@ const MIN_EXPONENT: f64 = 7.0;
 const RADIUS: [f64; 2] = [1.5, 4.0];
 
 impl<T: Real> TissueState<T> {
-    /// Returns the displacement of the surface at a place, m. On a sheet it is bilinear between the four points
-    /// around the place, and beyond the rim that of the rim; on a mesh it is that of the nearest point.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    /// Returns the displacement of the surface at a place, m ([`RestShape::interpolate`](crate::shape::RestShape)).
     pub(crate) fn surface_displacement(&self, place_m: DVec3) -> DVec3 {
-        let Some(sheet) = self.model.scene.sheet() else {
-            return self.point(self.model.shape().nearest(place_m)).displacement_m;
+        let displacement_m = |point| {
+            let place = self.model.point_of(self.model.place_of(point));
+            displacement_m(&self.model, &self.tables.layout, &self.state, place)
         };
-        let along = |axis: usize| {
-            let last = sheet.points[axis] - 1;
-            let at = (place_m[axis] / sheet.spacing_m).clamp(0.0, last as f64);
-            let from = (at as usize).min(last.saturating_sub(1));
-            (from, (from + 1).min(last), at - from as f64)
-        };
-        let ((i, above, s), (j, right, t)) = (along(0), along(1));
-        let at = |i: usize, j: usize| displacement_m(&self.model, &self.tables.layout, &self.state, [i, j]);
-        at(i, j).lerp(at(i, right), t).lerp(at(above, j).lerp(at(above, right), t), s)
+        self.model.shape().interpolate(place_m, &displacement_m)
     }
 
     /// Returns the weighted mean reaction around the centre of a force, N. The weights are those of the force,

@@ -2,5 +2,4 @@
 
 pub(crate) mod around_place;
 pub mod force_law;
-pub mod representative_place;
 pub mod tangent;

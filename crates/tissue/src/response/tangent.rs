@@ -19,16 +19,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use glam::{DMat3, DQuat, DVec3};
 
+use crate::body::MemoryLayout;
 use crate::body::footprint::{Footprint, WeightedNode};
+use crate::body::window::{Spring, Triple, Window};
 use crate::memory;
 use crate::model::Model;
-use crate::scene::{Body, FixedPoints, Sheet};
-use crate::shape::RestShape;
-
-mod window;
-
-use window::{Spring, Triple};
-pub use window::{Window, half_window_m};
 
 /// The accuracy of a solution: the bounds at which the solvers stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -348,45 +343,11 @@ impl<'m> LinearPatch<'m> {
         Tangent {
             stiffness_n_per_m,
             damping_n_s_per_m: scene.damping_n_s_per_m * unit,
-            drag_n_s_per_m: scene.damping_n_s_per_m * self.slopes(),
+            drag_n_s_per_m: scene.damping_n_s_per_m
+                * self.window.slopes(self.model, &self.springs, &self.masses, &self.displacement_m),
             mass_kg: scene.point_mass_kg() * unit.z_axis.z,
             iterations,
         }
-    }
-
-    /// Returns Σ |∂u/∂x|², the mean of both directions of the surface.
-    fn slopes(&self) -> f64 {
-        match &self.window {
-            Window::Grid { size, .. } => self.slopes_of_grid(*size),
-            Window::Ball(_) => self.slopes_along_springs(),
-        }
-    }
-
-    fn slopes_of_grid(&self, size: [usize; 2]) -> f64 {
-        let spacing_m = self.model.unit_m;
-        let mut sum = 0.0;
-        for i in 1..size[0].saturating_sub(1) {
-            for j in 1..size[1].saturating_sub(1) {
-                let at = i * size[1] + j;
-                let slope = |step: usize| self.displacement_m[at + step] - self.displacement_m[at - step];
-                sum += slope(1).length_squared() + slope(size[1]).length_squared();
-            }
-        }
-        sum / (8.0 * spacing_m * spacing_m)
-    }
-
-    /// Returns the sum of squared slopes; at each point the mean over its springs.
-    fn slopes_along_springs(&self) -> f64 {
-        let mut of_points = vec![(0.0, 0.0); self.free.len()];
-        for Spring { ends: [a, b], rest_m, .. } in &self.springs {
-            let slope = (self.displacement_m[*b] - self.displacement_m[*a]).length_squared() / rest_m.length_squared();
-            for end in [*a, *b] {
-                of_points[end].0 += slope;
-                of_points[end].1 += 1.0;
-            }
-        }
-        let with_mass = of_points.iter().zip(&self.masses).filter(|((_, count), _)| *count > 0.0);
-        with_mass.map(|((slopes, count), mass)| mass * slopes / count).sum()
     }
 
     /// Moves the disc's z to `-depth_m` quasi-statically (Newton's method). Returns the force on the disc, N.
@@ -442,7 +403,7 @@ const YIELDING: u64 = 100_000_000;
 /// m³/Pa. Empty without a volume.
 pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
     let Some(volume) = model.places.volume() else { return Vec::new() };
-    let (window, unit_m2) = (Window::Ball((0..model.len()).collect()), model.unit_m * model.unit_m);
+    let (window, unit_m2) = (Window::all(model), model.unit_m * model.unit_m);
     let zero = vec![DVec3::ZERO; window.len()];
     let patch = LinearPatch::weighted(model, vec![0.0; window.len()], window, zero, &DMat3::IDENTITY);
     let patch = LinearPatch { pressure: None, allowance: Allowance::of(YIELDING, stop), ..patch };
@@ -594,39 +555,19 @@ impl Press {
     }
 }
 
-/// Returns a sheet of the same tissue with points `spacing_m` (m) apart, each of which replaces several. It reaches
-/// `half_m` (m) from the middle, where it is held, or covers the whole sheet, with its fixed points, if that is not
-/// larger. The k of springs does not depend on their length; mass m, damping C and the stiffness K″ of anchor springs
-/// belong to an area and are multiplied by (`spacing_m`/h)², with h the distance between the points of `model`. The
-/// result serves presses alone: its plan is that of `model` and is not checked. A mesh is returned as it is.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+/// Returns a model of the same tissue with points `spacing_m` (m) apart, out to `half_m` (m) from the middle
+/// ([`Body::coarser`](crate::scene::Body::coarser)); if there is none, the model as it is. The k of springs does not
+/// depend on their length; mass m, damping C and the stiffness K″ of anchor springs belong to an area and are multiplied
+/// by the number of points that one replaces. The result serves presses alone: its plan is that of `model` and is not
+/// checked.
 pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
-    let Some(fine) = model.scene.sheet() else { return model.clone() };
-    let times = spacing_m / fine.spacing_m;
-    let is_cut = fine.longest_side_m() > 2.0 * half_m;
-    // As many on both sides of the middle.
-    let points = [0, 1].map(|axis| {
-        let extent_m = fine.extent_m()[axis];
-        2 * (extent_m.min(2.0 * half_m) / (2.0 * spacing_m)).round() as usize + 1
-    });
-    let fixed = match &fine.fixed {
-        _ if is_cut => FixedPoints::Edges,
-        FixedPoints::Points(named) => {
-            let coarse_of = |place: usize, most: usize| ((place as f64 / times).round() as usize).min(most - 1);
-            FixedPoints::Points(
-                named.as_slice().iter().map(|[i, j]| [coarse_of(*i, points[0]), coarse_of(*j, points[1])]).collect(),
-            )
-        }
-        set => set.clone(),
-    };
+    let Some((body, replaced)) = model.scene.body.coarser(spacing_m, half_m) else { return model.clone() };
     let mut scene = model.scene.clone();
-    let area = times * times;
-    let sheet = Sheet { points, spacing_m, point_mass_kg: area * fine.point_mass_kg, fixed };
-    let fixed = sheet.fixed_indices();
-    scene.body = Body::Sheet(sheet);
-    scene.anchor_stiffness_n_per_m *= area;
-    scene.damping_n_s_per_m *= area;
-    Model { points, fixed, unit_m: spacing_m, scene, ..model.clone() }
+    scene.body = body;
+    scene.anchor_stiffness_n_per_m *= replaced;
+    scene.damping_n_s_per_m *= replaced;
+    let Ok(MemoryLayout { points, fixed, places }) = MemoryLayout::of(&scene) else { return model.clone() };
+    Model { points, fixed, places, unit_m: spacing_m, scene, ..model.clone() }
 }
 
 #[cfg(test)]

@@ -76,9 +76,6 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
     Ok(())
 }
 
-/// The largest radius of a tip on a mesh, in edge lengths.
-const MAX_EDGES: f64 = 32.0;
-
 /// Checks that a tip suits the tissue: radius, friction and coupling.
 ///
 /// # Errors
@@ -87,12 +84,7 @@ const MAX_EDGES: f64 = 32.0;
 /// stiffness from 1e-12 to 1e12 N/m and a damping from 0 to 1e12 N·s/m. `field` is the tip's key: the refusal
 /// gives `{field}.radius_m` and the like.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
-    let longest_m = shape.longest_side_m();
-    let (most_m, what) = match MAX_EDGES * shape.edge_m() {
-        // What a disc covers is looked up at each step.
-        edges_m if shape.dimensions() > 2 && edges_m < longest_m => (edges_m, "32 lengths of an edge"),
-        _ => (longest_m, "the longest side of the tissue"),
-    };
+    let (most_m, what) = shape.most_tip_radius_m();
     let range = format!("above 0 and at most {}, {what}", legible(most_m));
     number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)
         .map_err(in_millimetres(tip.radius_m, most_m))?;

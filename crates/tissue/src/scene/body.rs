@@ -3,6 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
+use super::profile::Poke;
 use super::springs::Springs;
 use super::volume::Volume;
 use crate::limits::Limits;
@@ -123,6 +124,19 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
     /// Returns whether frames may show vertices between the points; otherwise they show the points alone.
     fn can_refine(&self) -> bool {
         false
+    }
+
+    /// Returns the largest displacement under a constant force, m, an upper bound from the springs at rest. `None` if
+    /// nothing bounds it, as without anchor springs, or if the tissue is uniform ([`RestShape::is_uniform`]): there the
+    /// force law of its middle tells more. The pressure of a volume has the stiffness `volume_pa`.
+    fn indentation_m(&self, _springs: &Springs, _anchor_n_per_m: f64, _volume_pa: f64, _poke: &Poke) -> Option<f64> {
+        None
+    }
+
+    /// Returns the thickness of the tissue under a point, m: the distance straight inward, against its normal, to
+    /// another part of the surface. `None` if there is none.
+    fn thickness_m(&self, _point: PointId) -> Option<f64> {
+        None
     }
 
     /// Returns the measured cost of a point relative to a point of a sheet.

@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
 use palpate_geometry::decimate::MIN_VERTICES;
-use palpate_geometry::surface::Surface;
+use palpate_geometry::surface::{Surface, SurfaceDisc};
 use palpate_geometry::work::spend;
 use palpate_geometry::{Group, TriangleMesh};
 
@@ -18,9 +18,16 @@ use super::volume::{Swelling, Volume};
 use crate::limits::Limits;
 use crate::scene::action_check::physical;
 use crate::scene::body::{BodyKind, StiffnessBound};
+use crate::scene::profile::Poke;
 use crate::scene::toml_document::{Fields, Item};
-use crate::shape::{Extent, PointId, PointName, RestShape};
+use crate::shape::{Deepest, Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
+
+mod indentation;
+mod tool_depth;
+
+/// The largest radius of a tip, in edge lengths.
+const MAX_TIP_EDGES: f64 = 32.0;
 
 /// A triangle mesh with a mass point at each vertex and a spring along each edge. [`Mesh::new`],
 /// [`Mesh::uneven`] and [`Mesh::of`] create it; they compute `stiffest`, which depends on the other fields, so
@@ -410,6 +417,14 @@ impl BodyKind for Mesh {
 
     /// The vertex that vibrates fastest is pushed; all others have smaller errors. (56 random meshes at 5
     /// tolerances: at most 1.4 times, half of them 0.05 times.)
+    fn indentation_m(&self, springs: &Springs, anchor_n_per_m: f64, volume_pa: f64, poke: &Poke) -> Option<f64> {
+        indentation::depth_m(self, springs, anchor_n_per_m, volume_pa, poke)
+    }
+
+    fn thickness_m(&self, point: PointId) -> Option<f64> {
+        indentation::thickness_m(self, point)
+    }
+
     fn rehearsal_margin(&self) -> f64 {
         2.0
     }
@@ -864,6 +879,32 @@ impl RestShape for MeshShape {
 
     fn top_m(&self) -> DVec3 {
         self.top_m
+    }
+
+    fn triangles(&self) -> Vec<[u32; 3]> {
+        MeshShape::triangles(self).to_vec()
+    }
+
+    fn shown_count(&self) -> usize {
+        self.shown().map_or(self.point_count(), |shown| shown.places.len())
+    }
+
+    fn deepest(&self, way_m: &[DVec3], radius_m: f64) -> Option<Deepest> {
+        tool_depth::deepest(self.surface(), way_m, radius_m)
+    }
+
+    /// Returns at most 32 lengths of an edge: what a disc covers is looked up at each step.
+    fn most_tip_radius_m(&self) -> (f64, &'static str) {
+        let (edges_m, longest_m) = (MAX_TIP_EDGES * self.edge_m, self.longest_side_m());
+        if edges_m < longest_m {
+            (edges_m, "32 lengths of an edge")
+        } else {
+            (longest_m, "the longest side of the tissue")
+        }
+    }
+
+    fn disc_work(&self, radius_m: f64) -> u64 {
+        SurfaceDisc::crossings(radius_m, self.edge_m)
     }
 }
 

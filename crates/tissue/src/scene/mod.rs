@@ -147,6 +147,19 @@ impl Body {
             }
         }
     }
+
+    /// Returns the same tissue with points `spacing_m` (m) apart, each of which replaces several, and the number of
+    /// points that one replaces. It reaches `half_m` (m) from the middle, where it is held, or is the whole tissue if
+    /// that is not larger. `None` if the tissue is not uniform ([`RestShape::is_uniform`]).
+    pub fn coarser(&self, spacing_m: f64, half_m: f64) -> Option<(Body, f64)> {
+        match self {
+            Body::Sheet(sheet) => {
+                let (coarse, replaced) = sheet.coarser(spacing_m, half_m);
+                Some((Body::Sheet(coarse), replaced))
+            }
+            Body::Mesh(_) => None,
+        }
+    }
 }
 
 /// Smallest side of a generated texture: 16 pixels. The largest is the limit `texture_side`.
@@ -481,6 +494,15 @@ impl Scene {
         match &mut self.body {
             Body::Sheet(sheet) => Some(sheet),
             Body::Mesh(_) => None,
+        }
+    }
+
+    /// Returns the triangle mesh that belongs to the scene besides its text: clients upload it, journals and other
+    /// servers keep it, and frames show it. `None` if the text describes the whole tissue.
+    pub fn mesh(&self) -> Option<&Mesh> {
+        match &self.body {
+            Body::Sheet(_) => None,
+            Body::Mesh(mesh) => Some(mesh),
         }
     }
 

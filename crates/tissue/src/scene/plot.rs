@@ -11,8 +11,8 @@ use crate::shape::RestShape;
 const MAX_KEPT: usize = 4096;
 
 /// Displacement and force of one tool or point over time, for a chart (`Display`, 140 dots wide, on several
-/// lines). On a sheet they are components along z, as in the paper's figures; on a mesh, which is pressed from
-/// any side, they are lengths. At most 4096 values are kept, evenly spaced, so the memory does not grow with
+/// lines): on a sheet components along z, as in the paper's figures; on a mesh, which is pressed from any side,
+/// lengths. At most 4096 values are kept, evenly spaced, so the memory does not grow with
 /// the length of a run.
 #[derive(Debug, Clone, Default)]
 pub struct Curves {
@@ -28,10 +28,10 @@ pub struct Curves {
 }
 
 impl Curves {
-    /// Creates empty curves for a tissue of this shape: of lengths, if places have 3 numbers
-    /// ([`RestShape::dimensions`]), otherwise of components along z.
+    /// Creates empty curves for a tissue of this shape, of lengths, unless the shape faces up
+    /// ([`RestShape::faces_up`]).
     pub fn of(shape: &dyn RestShape) -> Self {
-        Curves { of_lengths: shape.dimensions() > 2, ..Curves::default() }
+        Curves { of_lengths: !shape.faces_up(), ..Curves::default() }
     }
 
     /// Adds the displacement, m, and the force of the tissue on the tool, N, at a time, s. Times must ascend,

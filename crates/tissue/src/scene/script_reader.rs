@@ -183,7 +183,7 @@ impl Binding<'_> {
 
     /// Returns a place on the tissue, m: [x, y] on a sheet, [x, y, z] on a mesh.
     fn place(&self, item: &Item<'_>) -> Result<DVec3> {
-        if self.scene.shape().dimensions() == 2 { Ok(item.place()?.extend(0.0)) } else { item.vector() }
+        item.place_of(self.scene.shape().dimensions())
     }
 
     /// Reads changes of the tissue. Each is checked together with those before it.
@@ -474,16 +474,16 @@ impl Binding<'_> {
                 let far_m = place_m.distance(shape.extent().middle_m());
                 let field = fields.path("place_m");
                 check_reach(&field, shape, far_m, self.limits)?;
-                let extent = shape.extent();
-                let beside_m = (extent.least_m - place_m).max(place_m - extent.most_m).max(DVec3::ZERO).truncate();
-                if shape.dimensions() == 2 && beside_m != DVec2::ZERO {
-                    let off_m = legible(beside_m.length());
+                let beyond_m = shape.beyond_rim_m(place_m);
+                if beyond_m > 0.0 {
+                    let off_m = legible(beyond_m);
                     self.warnings.push(format!(
                         "{field}: is {off_m} m beside the tissue: a tip that touches drags the edge along"
                     ));
                 }
                 let touches = tip.grasps || place_m.z <= 0.0;
-                if beside_m == DVec2::ZERO && touches && shape.is_fixed(shape.nearest(place_m)) {
+                if shape.extent().beside_m(place_m) == DVec2::ZERO && touches && shape.is_fixed(shape.nearest(place_m))
+                {
                     let message = "is at a fixed point: the tissue does not move there, and the tool feels nothing";
                     self.warnings.push(format!("{field}: {message}"));
                 }

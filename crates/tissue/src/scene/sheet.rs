@@ -11,8 +11,10 @@ use crate::scene::action_check::physical;
 use crate::scene::body::BodyKind;
 use crate::scene::springs::Springs;
 use crate::scene::toml_document::{Fields, Item};
-use crate::shape::{Extent, PointId, PointName, RestShape};
+use crate::shape::{Deepest, Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};
+
+mod representative;
 
 /// Smallest number of points per row (along y) in memory: 16, the lanes of the widest vector. Shorter rows are
 /// padded, and count as that many against `limits.points`.
@@ -125,6 +127,36 @@ impl Sheet {
         }
         let others = [[nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|place| part.point(place));
         (part, [pushed, others[0], others[1]])
+    }
+
+    /// Returns a sheet with points `spacing_m` (m) apart, each of which replaces several, and the number of points that
+    /// one replaces, (`spacing_m`/h)². It reaches `half_m` (m) from the middle, where it is held, or covers the whole
+    /// sheet, with its fixed points, if that is not larger.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(super) fn coarser(&self, spacing_m: f64, half_m: f64) -> (Self, f64) {
+        let times = spacing_m / self.spacing_m;
+        let is_cut = self.longest_side_m() > 2.0 * half_m;
+        // As many on both sides of the middle.
+        let points = [0, 1].map(|axis| {
+            let extent_m = self.extent_m()[axis];
+            2 * (extent_m.min(2.0 * half_m) / (2.0 * spacing_m)).round() as usize + 1
+        });
+        let fixed = match &self.fixed {
+            _ if is_cut => FixedPoints::Edges,
+            FixedPoints::Points(named) => {
+                let coarse_of = |place: usize, most: usize| ((place as f64 / times).round() as usize).min(most - 1);
+                FixedPoints::Points(
+                    named
+                        .as_slice()
+                        .iter()
+                        .map(|[i, j]| [coarse_of(*i, points[0]), coarse_of(*j, points[1])])
+                        .collect(),
+                )
+            }
+            set => set.clone(),
+        };
+        let replaced = times * times;
+        (Sheet { points, spacing_m, point_mass_kg: replaced * self.point_mass_kg, fixed }, replaced)
     }
 
     /// Returns the row-major indices i·ny + j of the fixed points, ascending, each once. Without memory for
@@ -332,6 +364,62 @@ impl RestShape for Sheet {
 
     fn dimensions(&self) -> usize {
         2
+    }
+
+    fn in_plane_m(&self, _: &str, place_m: DVec2) -> Result<DVec3> {
+        Ok(place_m.extend(0.0))
+    }
+
+    fn grid(&self) -> Option<[usize; 2]> {
+        Some(self.points)
+    }
+
+    /// Returns two triangles for each cell.
+    #[allow(clippy::cast_possible_truncation)]
+    fn triangles(&self) -> Vec<[u32; 3]> {
+        let [nx, ny] = self.points.map(|points| points as u32);
+        let cells = (0..nx.saturating_sub(1)).flat_map(|i| (0..ny.saturating_sub(1)).map(move |j| i * ny + j));
+        cells.flat_map(|at| [[at, at + ny, at + ny + 1], [at, at + ny + 1, at + 1]]).collect()
+    }
+
+    fn is_uniform(&self) -> bool {
+        true
+    }
+
+    fn representative_m(&self, radius_m: f64, noticed_m: f64, place_m: DVec3) -> DVec3 {
+        representative::of(self, radius_m, noticed_m, place_m.truncate()).extend(0.0)
+    }
+
+    /// Interpolates bilinearly between the four points around a place; a place beyond the rim has the value of the
+    /// rim.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn interpolate(&self, place_m: DVec3, value: &dyn Fn(PointId) -> DVec3) -> DVec3 {
+        let along = |axis: usize| {
+            let last = self.points[axis] - 1;
+            let at = (place_m[axis] / self.spacing_m).clamp(0.0, last as f64);
+            let from = (at as usize).min(last.saturating_sub(1));
+            (from, (from + 1).min(last), at - from as f64)
+        };
+        let ((i, above, s), (j, right, t)) = (along(0), along(1));
+        let at = |i: usize, j: usize| value(self.point([i, j]));
+        at(i, j).lerp(at(i, right), t).lerp(at(above, j).lerp(at(above, right), t), s)
+    }
+
+    /// Returns the lowest place over the sheet, and the middle of the sheet as the place that is pressed: the sheet is
+    /// the same everywhere.
+    fn deepest(&self, way_m: &[DVec3], radius_m: f64) -> Option<Deepest> {
+        let extent = self.extent();
+        let parts = way_m.windows(2).filter_map(|pair| extent.part_beneath_m([pair[0], pair[1]], radius_m));
+        let lowest_m = parts.flatten().map(|place_m| place_m.z).reduce(f64::min)?;
+        Some(Deepest { depth_m: extent.most_m.z - lowest_m, rest_m: extent.middle_m() })
+    }
+
+    fn beyond_rim_m(&self, place_m: DVec3) -> f64 {
+        self.extent().beside_m(place_m).length()
+    }
+
+    fn faces_up(&self) -> bool {
+        true
     }
 }
 

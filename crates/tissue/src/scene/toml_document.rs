@@ -460,6 +460,18 @@ impl<'a> Item<'a> {
         Ok(DVec2::from_array(self.numbers("a list of two numbers")?))
     }
 
+    /// Returns the value as a place of a shape whose places have `dimensions` numbers, in the unit that its key names:
+    /// `[x, y]` with z = 0, or `[x, y, z]`.
+    ///
+    /// # Errors
+    /// Refuses a value that is not a list of so many numbers ([`Reason::WrongKind`]), and a number that is not finite.
+    pub fn place_of(&self, dimensions: usize) -> Result<DVec3> {
+        match dimensions {
+            2 => Ok(self.place()?.extend(0.0)),
+            _ => self.vector(),
+        }
+    }
+
     /// Returns the value as `[i, j]`, both 0 or more. Whether a tissue has this point is not checked.
     ///
     /// # Errors

@@ -6,11 +6,11 @@ use palpate_haptics::ContactState;
 
 use crate::body::footprint::WeightedNode;
 use crate::body::tables::SweepTables;
+use crate::body::window::Window;
 use crate::kernel::field::{Field, State};
 use crate::kernel::real::Real;
 use crate::memory;
 use crate::model::{Model, Plan};
-use crate::response::tangent::Window;
 use crate::state::tissue_state::{TissueState, spring_force_n};
 use crate::tools::contact::{
     ContactForce, TangentInput, Tool, ToolContact, displacement_m, movement_m, push, within_cone,

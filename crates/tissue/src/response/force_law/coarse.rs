@@ -15,6 +15,7 @@ use palpate_haptics::force_law::{Law, Row};
 use super::disc::Disc;
 use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
 use crate::Model;
+use crate::body::window::half_window_m;
 use crate::response::tangent::{self, Accuracy, Course};
 
 /// Largest work of a first law, springs times iterations: 46 ms of processor time, at 27 ns per unit on an AMD EPYC
@@ -39,7 +40,7 @@ const POINTS: [(usize, u64); 3] = [(500, 650_000), (250, 200_000), (120, 0)];
 const FINE_ENOUGH: f64 = 0.7;
 
 /// Computes the first force law of a disc, on the calling thread: the exact one if it takes little work, otherwise a
-/// coarse one ([`Law::is_coarse`]), on a sheet that of its middle. `None` if that would take more than about 50 ms as
+/// coarse one ([`Law::is_coarse`]), on a uniform tissue that of its middle. `None` if that would take more than about 50 ms as
 /// well, if another thread sets `stop`, or if the coarse law is not sound. Work is counted, not timed, so every
 /// machine gives the same law. Unwinds with a refusal if there is no memory ([`attempt`](crate::memory::attempt)).
 pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
@@ -47,7 +48,7 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
-        if model.shape().dimensions() > 2 {
+        if !model.shape().is_uniform() {
             return POINTS.iter().find_map(|(points, kept)| {
                 let most = left.saturating_sub(*kept);
                 let mut work = most;
@@ -125,7 +126,7 @@ fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) ->
 fn coarse(model: &Model, radius_m: f64, half: u32, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
     let mut of = |model: &Model| pressed(model, Disc::in_middle(model, radius_m), ROWS, Accuracy::COARSE, work, stop);
     let (size_m, edge_m) = (model.shape().extent().size_m(), model.shape().edge_m());
-    let half_m = tangent::half_window_m(model, radius_m).min(0.5 * model.shape().longest_side_m());
+    let half_m = half_window_m(model, radius_m).min(0.5 * model.shape().longest_side_m());
     // Choose intervals that also end at the rim of the shorter side.
     let shorter_m = half_m.min(0.5 * size_m.x.min(size_m.y));
     let fitting = if shorter_m > 0.0 { best_half(half, half_m / shorter_m) } else { half };

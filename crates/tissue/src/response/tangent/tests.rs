@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use glam::DVec2;
 
-use super::window::REACHES;
 use super::*;
+use crate::body::window::{REACHES, half_window_m};
 use crate::limits::Limits;
 use crate::scene::Scene;
+use crate::scene::{FixedPoints, Sheet};
 
 fn model(sets: &[&str]) -> Arc<Model> {
     let always = ["stepping.integrator=central", "stepping.substeps=1", "sheet.spacing_m=0.02"];

@@ -3,20 +3,13 @@
 use glam::DVec3;
 use palpate_geometry::surface::Surface;
 
+use crate::shape::Deepest;
+
 /// Limit of the samples of a straight part of a path: each searches for the nearest place of the surface.
 const MAX_SAMPLES: u32 = 256;
 
-/// The deepest place of a tool's path.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Deepest {
-    /// Depth below the surface, on the side where the tool did not begin, m; negative if it stays away.
-    pub(super) depth_m: f64,
-    /// The place of the surface that is nearest to it, m.
-    pub(super) rest_m: DVec3,
-}
-
 /// Returns the deepest place of a path along these points by a tip of `radius_m`, m, as a tool meets a mesh
-/// (`palpate_tissue::contact`): relative to the side on which it begins, and only while the nearest place of the
+/// (`tools/contact.rs`): relative to the side on which it begins, and only while the nearest place of the
 /// surface is within its radius across the normal. `None` if it is beside the mesh all the time.
 pub(super) fn deepest(surface: &Surface, way_m: &[DVec3], radius_m: f64) -> Option<Deepest> {
     let last = way_m.last().map(|end_m| [*end_m; 2]);

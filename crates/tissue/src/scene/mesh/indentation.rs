@@ -1,37 +1,43 @@
-//! How deep a force dents a mesh, and how thick the tissue is beneath: both at rest, for `palpate check`.
+//! How deep a force dents a mesh, and how thick the tissue is beneath: both at rest.
 
 use glam::DVec3;
 
-use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::{Body, Mesh, Scene};
-use palpate_tissue::shape::{self, PointId, RestShape};
+use super::Mesh;
+use crate::scene::body::BodyKind;
+use crate::scene::profile::Poke;
+use crate::scene::springs::Springs;
+use crate::shape::{self, PointId, RestShape};
 
 /// Limit of the steps of the conjugate gradients, and the part of the first residual at which they end.
 const MAX_STEPS: usize = 200;
 const RESIDUAL: f64 = 1e-8;
 
-/// Returns the largest displacement of a mesh under a constant force, m, if springs kept their initial stiffness.
-/// That is an upper bound, because a dent stretches springs, which then resist more. `None` for a sheet, and for a
-/// mesh without anchor springs.
-pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
-    let Body::Mesh(mesh) = &scene.body else { return None };
-    if scene.anchor_stiffness_n_per_m <= 0.0 {
+/// Returns the largest displacement under a constant force, m, if springs kept their initial stiffness
+/// ([`BodyKind::indentation_m`](crate::scene::BodyKind::indentation_m)). That is an upper bound, because a dent
+/// stretches springs, which then resist more.
+pub(super) fn depth_m(
+    mesh: &Mesh,
+    springs: &Springs,
+    anchor_n_per_m: f64,
+    volume_stiffness_pa: f64,
+    poke: &Poke,
+) -> Option<f64> {
+    if anchor_n_per_m <= 0.0 {
         return None;
     }
     let shape = &mesh.shape;
-    let pulls: Vec<f64> = shape::points(&**shape)
-        .map(|point| scene.anchor_stiffness_n_per_m * scene.relative_anchor_stiffness(point))
-        .collect();
-    let springs: Vec<([usize; 2], f64, DVec3)> = mesh
+    let pulls: Vec<f64> =
+        shape::points(&**shape).map(|point| anchor_n_per_m * mesh.relative_anchor_stiffness(point)).collect();
+    let joined: Vec<([usize; 2], f64, DVec3)> = mesh
         .springs()
         .map(|(ends, k)| {
             let ends = ends.map(|end| end as usize);
             let along = (shape.vertices_m()[ends[1]] - shape.vertices_m()[ends[0]]).normalize_or_zero();
-            (ends, k * scene.springs.stiffness_n_per_m, along)
+            (ends, k * springs.stiffness_n_per_m, along)
         })
         .collect();
     let mut diagonal: Vec<DVec3> = pulls.iter().map(|pull| DVec3::splat(*pull)).collect();
-    for ([a, b], k, along) in &springs {
+    for ([a, b], k, along) in &joined {
         diagonal[*a] += *k * *along * *along;
         diagonal[*b] += *k * *along * *along;
     }
@@ -39,7 +45,7 @@ pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
     let (areas_m2, pa_per_m3) = mesh
         .volume
         .as_ref()
-        .map_or((&[][..], 0.0), |volume| (&volume.areas_m2[..], scene.volume_stiffness_pa / volume.volume_m3));
+        .map_or((&[][..], 0.0), |volume| (&volume.areas_m2[..], volume_stiffness_pa / volume.volume_m3));
     diagonal.iter_mut().zip(areas_m2).for_each(|(diagonal, area)| *diagonal += pa_per_m3 * *area * *area);
     let free = |vertex: usize| !shape.is_fixed(PointId::new(vertex));
     let force_n = |vertex: usize| {
@@ -59,7 +65,7 @@ pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
             break;
         }
         let mut product: Vec<DVec3> = direction.iter().zip(&pulls).map(|(d, pull)| *pull * *d).collect();
-        for ([a, b], k, along) in &springs {
+        for ([a, b], k, along) in &joined {
             let force = *k * along.dot(direction[*b] - direction[*a]) * *along;
             product[*a] -= force;
             product[*b] += force;
@@ -105,7 +111,8 @@ mod tests {
     use glam::DMat3;
 
     use super::*;
-    use palpate_tissue::limits::Limits;
+    use crate::limits::Limits;
+    use crate::scene::Scene;
 
     fn gallbladder(foundation_n_per_m3: &str) -> Scene {
         let text = format!(
@@ -115,10 +122,15 @@ mod tests {
         Scene::parse("test", &text, &[], &Limits::default()).unwrap()
     }
 
+    fn indentation_m(scene: &Scene, poke: &Poke) -> f64 {
+        let (anchor_n_per_m, volume_pa) = (scene.anchor_stiffness_n_per_m, scene.volume_stiffness_pa);
+        scene.body.kind().indentation_m(&scene.springs, anchor_n_per_m, volume_pa, poke).unwrap()
+    }
+
     #[test]
     fn a_dent_is_as_deep_as_the_bed_lets_it_and_a_ball_as_thick_as_it_is_wide() {
         let scene = gallbladder("5e5");
-        let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
+        let mesh = scene.mesh().unwrap();
         // The middle of the bottom.
         let point = mesh.shape.nearest(DVec3::new(0.02, 0.0, -0.05));
         let thick_m = thickness_m(mesh, point).unwrap();
@@ -131,7 +143,7 @@ mod tests {
             falloff_per_m,
             falloff_offset: 0.0,
         };
-        let depth_m = |poke: &Poke| depth_m(&scene, poke).unwrap();
+        let depth_m = |poke: &Poke| indentation_m(&scene, poke);
         let inward = -mesh.shape.normal(point);
         let (near_m, twice_m) = (depth_m(&poke(0.01 * inward, 200.0)), depth_m(&poke(0.02 * inward, 200.0)));
         assert!((twice_m / near_m - 2.0).abs() < 1e-6 && near_m > 1e-4, "{near_m} {twice_m}");
@@ -143,7 +155,7 @@ mod tests {
     #[test]
     fn a_tissue_is_as_thick_as_it_is_far_to_where_straight_in_meets_its_other_side() {
         let scene = gallbladder("5e6");
-        let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
+        let mesh = scene.mesh().unwrap();
         let surface = mesh.shape.surface();
         let points: Vec<PointId> = shape::points(&*mesh.shape).step_by(7).collect();
         let mut found = 0;
@@ -161,7 +173,7 @@ mod tests {
     #[test]
     fn a_dent_is_that_in_which_springs_and_bed_balance_the_force_at_every_point() {
         let scene = gallbladder("5e6");
-        let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
+        let mesh = scene.mesh().unwrap();
         let shape = &mesh.shape;
         let point = shape.nearest(DVec3::new(0.02, 0.0, -0.05));
         let (centre_m, force_n) = (shape.rest_m(point), DVec3::new(0.02, 0.01, 0.03));
@@ -200,7 +212,7 @@ mod tests {
             }
         }
         let deepest_m = moved_m.iter().map(|moved_m| moved_m.length()).fold(0.0, f64::max);
-        let found_m = depth_m(&scene, &poke).unwrap();
+        let found_m = indentation_m(&scene, &poke);
         assert!((found_m / deepest_m - 1.0).abs() < 1e-4, "{found_m} m, not {deepest_m}");
     }
 }

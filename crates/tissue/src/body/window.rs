@@ -7,7 +7,7 @@ use crate::body::footprint::Footprint;
 use crate::model::Model;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
-pub(super) const REACHES: f64 = 6.0;
+pub(crate) const REACHES: f64 = 6.0;
 
 /// Memory of a point of a patch with six springs, and of the vectors of a solution. The work of a force law is
 /// bounded, and so is its memory: 20 MB for the 116² points that 2^27 springs times iterations allow.
@@ -15,17 +15,17 @@ const BYTES_PER_POINT: usize =
     6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
 
 /// Three vectors per point: one of each system.
-pub(super) type Triple = [DVec3; 3];
+pub(crate) type Triple = [DVec3; 3];
 
 /// A spring of the part, linearised at the present displacements.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Spring {
-    pub(super) ends: [usize; 2],
-    pub(super) rest_m: DVec3,
-    pub(super) stiffness_n_per_m: f64,
-    pub(super) tangent: DMat3,
+pub(crate) struct Spring {
+    pub(crate) ends: [usize; 2],
+    pub(crate) rest_m: DVec3,
+    pub(crate) stiffness_n_per_m: f64,
+    pub(crate) tangent: DMat3,
     /// Force on the first end, N.
-    pub(super) force_n: DVec3,
+    pub(crate) force_n: DVec3,
 }
 
 impl Spring {
@@ -57,7 +57,7 @@ impl Window {
 
     /// Returns the window around a place of the rest surface; on a mesh, the radius shrinks until it has at
     /// most `most` points.
-    pub(super) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
+    pub(crate) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
         match &model.places {
             Places::Sheet(_) => Self::of_sheet(model, radius_m, centre_m.truncate()),
             Places::Surface(_) => {
@@ -89,6 +89,14 @@ impl Window {
         Window::Grid { origin, size }
     }
 
+    /// Returns the window of all points, in the order of memory.
+    pub(crate) fn all(model: &Model) -> Self {
+        match &model.places {
+            Places::Sheet(_) => Window::Grid { origin: [0; 2], size: model.points },
+            Places::Surface(_) => Window::Ball((0..model.len()).collect()),
+        }
+    }
+
     /// Returns the number of points of the window.
     pub fn len(&self) -> usize {
         match self {
@@ -103,7 +111,7 @@ impl Window {
     }
 
     /// Returns the approximate number of points from the middle to where nothing is noticed.
-    pub(super) fn across(&self) -> usize {
+    pub(crate) fn across(&self) -> usize {
         match self {
             Window::Grid { size, .. } => size[0].max(size[1]),
             Window::Ball(slots) => slots.len().isqrt(),
@@ -126,7 +134,7 @@ impl Window {
     }
 
     /// Returns the index in the window of the point at a row and column of memory, if it is in the window.
-    pub(super) fn find(&self, model: &Model, point @ [i, j]: [usize; 2]) -> Option<usize> {
+    pub(crate) fn find(&self, model: &Model, point @ [i, j]: [usize; 2]) -> Option<usize> {
         match self {
             Window::Grid { origin, size } => {
                 let place = (i.wrapping_sub(origin[0]), j.wrapping_sub(origin[1]));
@@ -138,7 +146,7 @@ impl Window {
 
     /// Returns which of the points can move. Points at the border, whose springs lead out of the window, are
     /// held.
-    pub(super) fn free(&self, model: &Model) -> Vec<bool> {
+    pub(crate) fn free(&self, model: &Model) -> Vec<bool> {
         let is_fixed = |index: usize| model.fixed.binary_search(&index).is_ok();
         match self {
             Window::Ball(slots) => {
@@ -161,7 +169,7 @@ impl Window {
 
     /// Returns the springs that join points of the window, at least one of which is `free`. Rest vectors are
     /// turned by `turn`.
-    pub(super) fn springs(&self, model: &Model, free: &[bool], turn: &DMat3) -> Vec<Spring> {
+    pub(crate) fn springs(&self, model: &Model, free: &[bool], turn: &DMat3) -> Vec<Spring> {
         let mut springs = match self {
             Window::Ball(slots) => of_mesh(model, slots, free),
             Window::Grid { size, .. } => of_grid(model, *size, free),
@@ -169,6 +177,42 @@ impl Window {
         springs.iter_mut().for_each(|spring| spring.rest_m = *turn * spring.rest_m);
         springs
     }
+
+    /// Returns Σ m·|∂u/∂x|² over the points, the mean of both directions of the surface, with the relative `masses` of
+    /// the points (on a sheet, all 1).
+    pub(crate) fn slopes(&self, model: &Model, springs: &[Spring], masses: &[f64], displacement_m: &[DVec3]) -> f64 {
+        match self {
+            Window::Grid { size, .. } => slopes_of_grid(model.unit_m, *size, displacement_m),
+            Window::Ball(_) => slopes_along_springs(springs, masses, displacement_m),
+        }
+    }
+}
+
+/// Returns the sum of squared slopes at the inner points of a grid, from the differences of their neighbours.
+fn slopes_of_grid(spacing_m: f64, size: [usize; 2], displacement_m: &[DVec3]) -> f64 {
+    let mut sum = 0.0;
+    for i in 1..size[0].saturating_sub(1) {
+        for j in 1..size[1].saturating_sub(1) {
+            let at = i * size[1] + j;
+            let slope = |step: usize| displacement_m[at + step] - displacement_m[at - step];
+            sum += slope(1).length_squared() + slope(size[1]).length_squared();
+        }
+    }
+    sum / (8.0 * spacing_m * spacing_m)
+}
+
+/// Returns the sum of squared slopes; at each point the mean over its springs.
+fn slopes_along_springs(springs: &[Spring], masses: &[f64], displacement_m: &[DVec3]) -> f64 {
+    let mut of_points = vec![(0.0, 0.0); masses.len()];
+    for Spring { ends: [a, b], rest_m, .. } in springs {
+        let slope = (displacement_m[*b] - displacement_m[*a]).length_squared() / rest_m.length_squared();
+        for end in [*a, *b] {
+            of_points[end].0 += slope;
+            of_points[end].1 += 1.0;
+        }
+    }
+    let with_mass = of_points.iter().zip(masses).filter(|((_, count), _)| *count > 0.0);
+    with_mass.map(|((slopes, count), mass)| mass * slopes / count).sum()
 }
 
 fn of_grid(model: &Model, size: [usize; 2], free: &[bool]) -> Vec<Spring> {
