@@ -7,11 +7,12 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::model::{Model, Plan};
-use crate::guard::checkpoint::CheckFailure;
+use crate::guard::work::CheckFailure;
 use crate::kernel::field::BLOCK;
 use crate::scene::profile::Poke;
 use crate::select::audit_window::{Mark, WindowInputs};
 use crate::shape::PointId;
+use crate::state::profile::Profile;
 use crate::state::saved::SavedTissue;
 use crate::tools::applied_force::Push;
 use crate::tools::contact::{TangentInput, ToolContact};
@@ -150,6 +151,11 @@ pub trait Tissue: Send {
     /// same number format; for f64 after another format, first ask [`Tissue::changed`]. Displacements and
     /// velocities stay; all tiles wake, halvings of the substep end, and a running audit is dropped.
     fn change(&mut self, model: &Arc<Model>);
+    /// Begins to measure how long each stage of a step takes, by a clock that never goes back, ns; `None` ends it. Without
+    /// a clock it costs nothing.
+    fn set_profile(&mut self, now_ns: Option<fn() -> u64>);
+    /// Returns what was measured since [`Tissue::set_profile`]; `None` without a clock.
+    fn profile(&self) -> Option<&Profile>;
     /// Requests an audit of a window of steps, which begins at the next checkpoint. `inputs` is the memory in
     /// which the tools' inputs are recorded; it is emptied. A new request replaces one that waits or runs,
     /// without a report.

@@ -28,10 +28,11 @@ mod tools;
 
 pub use body::footprint::{Footprint, RestSurface, WeightedNode};
 pub use compile::check_processor;
-pub use guard::checkpoint::CheckFailure;
+pub use guard::work::CheckFailure;
 pub use interface::{BlowUp, Energy, Hashing, PointState, ReadCopy, Released, Tissue};
 pub use model::{Model, Plan};
 pub use scheme::order;
+pub use state::profile::{Profile, StepStage};
 pub use state::restore::restored;
 pub use state::tissue_state::at_rest;
 pub use tools::applied_force::Push;

@@ -100,6 +100,23 @@ impl Plan {
         Plan::new(self.integrator, self.substeps * by, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
     }
 
+    /// Returns the work of a force of 1 in the fields of the tools along a displacement of 1, J.
+    pub(super) fn unit_of_work_j(&self, model: &Model) -> f64 {
+        model.unit_m / (self.scheme.impulse() * self.force_scale(&model.scene))
+    }
+
+    /// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables and the
+    /// displacement in spacings.
+    pub(super) fn spring_force_n(&self, model: &Model, index: usize, gathered: f64, u: f64) -> f64 {
+        let force_n = gathered / (self.scheme.spring_scale() * self.force_scale(&model.scene));
+        if !model.places.differ() {
+            return force_n;
+        }
+        // Anchor stiffness beyond the reference K″ is not part of the springs.
+        let pulled_n = model.scene.anchor_stiffness_n_per_m * model.extra_anchor_at(index) * u * model.unit_m;
+        model.relative_mass_at(index) * (force_n + pulled_n)
+    }
+
     /// Returns the factor from newtons on a point of the reference mass to the scheme's unit of force:
     /// dt²/(m·h), 1/N.
     pub(super) fn force_scale(&self, scene: &Scene) -> f64 {

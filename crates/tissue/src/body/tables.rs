@@ -141,6 +141,13 @@ impl<T: Real> SweepTables<T> {
         self.pressure.as_ref().map_or(0.0, |pressure| pressure.volume_change(self.width, &self.layout, u, tiles))
     }
 
+    /// Computes the growth of a volume from the awake tiles, and applies its pressure. Returns the growth.
+    pub(crate) fn press(&self, u: &Field<T>, tiles: &[usize]) -> f64 {
+        let volume_change = self.volume_change(u, tiles);
+        self.apply_volume_pressure(volume_change);
+        volume_change
+    }
+
     /// Sets the pressure of the next sweeps for a growth of the volume.
     pub(crate) fn apply_volume_pressure(&self, volume_change: f64) {
         if let (Some(pressure), Elastic::Mesh(.., factor)) = (&self.pressure, &self.springs) {

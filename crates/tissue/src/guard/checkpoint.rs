@@ -1,66 +1,17 @@
-//! The guard's data: checkpoints to go back to, the tools' inputs, and the account of work.
-
-use std::fmt;
+//! The guard's data: checkpoints to go back to, and the tools' inputs.
 
 use glam::DVec3;
 
+use crate::guard::work::Work;
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::model::Model;
-use crate::shape::PointName;
-use crate::state::saved::{Checks, SavedInput, SavedTip, SavedWork, ensure};
+use crate::state::saved::{Checks, SavedInput, SavedTip};
 use crate::tools::applied_force::{Applied, Push};
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::{Grasp, Prescribed, restored_index};
 use palpate_haptics::Tip;
 use palpate_refusal::Result;
-
-/// Tolerance of the energy balance, as a fraction of the energy at the last survey plus the size of the tools' work:
-/// errors of the schemes at the stability bound.
-pub const MARGIN: f64 = 0.05;
-
-/// Reason why a check of the guard failed.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum CheckFailure {
-    /// A point is not finite, or is displaced by a billion times the tissue's size.
-    NotFinite {
-        /// One such point.
-        point: PointName,
-    },
-    /// The energy rose by more than the tools' work and the tolerance ([`MARGIN`]).
-    Energy {
-        /// Energy of springs, anchor springs and motion, J.
-        energy_j: f64,
-        /// That energy at the last survey, J.
-        before_j: f64,
-        /// Work of all tools since, J.
-        work_j: f64,
-    },
-    /// The springs' force is far from its prediction: by more than [`super::MAX_PREDICTION_ERROR`].
-    Prediction {
-        /// The resulting difference of a displacement, as a fraction of the largest displacement.
-        part: f64,
-    },
-}
-
-impl fmt::Display for CheckFailure {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            CheckFailure::NotFinite { point } => {
-                write!(f, "point {point} was not finite (or a billion tissues away)")
-            }
-            CheckFailure::Energy { energy_j, before_j, work_j } => {
-                write!(
-                    f,
-                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
-                )
-            }
-            CheckFailure::Prediction { part } => {
-                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
-            }
-        }
-    }
-}
 
 /// An input of a tool.
 #[derive(Debug, Clone)]
@@ -115,105 +66,4 @@ pub(crate) struct Repetition {
     pub(crate) inputs: Vec<(u64, usize, Input)>,
     pub(crate) next_input: usize,
     pub(crate) halvings: u32,
-}
-
-/// By how much an energy may rise without a cause.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Noise {
-    /// Part of the largest energy so far that counts as noise.
-    pub(crate) part: f64,
-    pub(crate) energy_j: f64,
-}
-
-/// The account of the tools' work, J, and of energies at the last survey.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct Work {
-    /// Work since the last survey, plus what its `present_j` subtracted.
-    pub(crate) done_j: f64,
-    /// Energy at the last survey.
-    energy_j: f64,
-    /// The largest energy at any survey.
-    largest_j: f64,
-    /// How much the energy has risen beyond the work while tools touch or hold, minus its losses since.
-    excess_j: f64,
-}
-
-impl Work {
-    /// Adds work.
-    pub(crate) fn add(&mut self, work_j: f64) {
-        self.done_j += work_j;
-    }
-
-    pub(crate) fn saved(&self) -> SavedWork {
-        let Work { done_j, energy_j, largest_j, excess_j } = *self;
-        SavedWork { done_j, energy_j, largest_j, excess_j }
-    }
-
-    pub(crate) fn restored(saved: &SavedWork) -> Result<Self> {
-        let SavedWork { done_j, energy_j, largest_j, excess_j } = *saved;
-        let is_finite = [done_j, energy_j, largest_j, excess_j].iter().all(|energy_j| energy_j.is_finite());
-        ensure(is_finite, "an energy that is not finite")?;
-        Ok(Work { done_j, energy_j, largest_j, excess_j })
-    }
-
-    /// Creates an account that begins with the given energy.
-    pub(crate) fn begun(energy_j: f64, present_j: f64) -> Self {
-        Work { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
-    }
-
-    /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so far and
-    /// belongs to the next interval. The account then begins anew. Only the excess while tools touch or hold
-    /// (`is_touched`) is kept, so that a small gain in every interval can't continue forever.
-    pub(crate) fn survey(
-        &mut self,
-        energy_j: f64,
-        present_j: f64,
-        noise: Noise,
-        is_touched: bool,
-    ) -> std::result::Result<(), CheckFailure> {
-        let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
-        let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
-        // NaN is not within it.
-        let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise.part * self.largest_j + noise.energy_j;
-        if !is_within {
-            return Err(CheckFailure::Energy { energy_j, before_j, work_j });
-        }
-        let largest_j = self.largest_j.max(energy_j);
-        *self = Work { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
-        Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn energy_comes_from_work_alone() {
-        const EXACT: Noise = Noise { part: 0.0, energy_j: 0.0 };
-        let begun = Work::begun(1.0, 0.0);
-        // Up to the margin.
-        assert_eq!({ begun }.survey(1.04, 0.0, EXACT, false), Ok(()));
-        let found = CheckFailure::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
-        assert_eq!({ begun }.survey(1.2, 0.0, EXACT, false), Err(found));
-        let mut worked = begun;
-        worked.add(0.25);
-        // Work that belongs to the next interval does not count in this one.
-        assert!({ worked }.survey(1.25, 0.2, EXACT, false).is_err());
-        assert_eq!(worked.survey(1.2, 0.05, EXACT, false), Ok(()));
-        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2, excess_j: 0.0 });
-        // A gain within the margin counts against the next while a tool touches, until it is lost again.
-        let mut touched = begun;
-        assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
-        assert!({ touched }.survey(1.06, 0.0, EXACT, true).is_err());
-        assert_eq!({ touched }.survey(1.06, 0.0, EXACT, false), Ok(()));
-        assert_eq!(touched.survey(1.0, 0.0, EXACT, true), Ok(()));
-        assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
-        // Rounding noise does not count as energy.
-        let rounding = Noise { energy_j: 1e-27, ..EXACT };
-        assert_eq!(Work::default().survey(1e-30, 0.0, rounding, true), Ok(()));
-        assert!(Work::default().survey(1e-24, 0.0, rounding, true).is_err());
-        // Losing energy is always allowed.
-        assert_eq!(worked.survey(0.01, 0.0, EXACT, false), Ok(()));
-    }
 }

@@ -16,10 +16,10 @@ use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::stage::Stage;
+use crate::model::{Model, Plan};
 use crate::scheme::Scheme;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::observer::Observer;
-use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::{self, Pull, Term};
 
 /// The result of a survey, in the scheme's units (`scheme`).
@@ -302,48 +302,22 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
     }
 }
 
-impl<T: Real> TissueState<T> {
-    /// Returns the tools' force at the end of the last step, in the springs' units, if the scheme needs it to
-    /// observe a velocity; otherwise nothing.
-    pub(crate) fn present_terms(&self) -> Vec<Term<T>> {
-        let TissueState { model, plan, tables, .. } = self;
-        if !plan.scheme.takes_means() || self.steps == 0 {
-            return Vec::new();
-        }
-        self.applied.until_now(model, &tables.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
-    }
+/// Returns the energies of a survey, and the energy that the scheme conserves.
+pub(crate) fn energy_of(model: &Model, plan: &Plan, survey: &Survey) -> (Energy, f64) {
+    // Twice the energy of a point that moves by a spacing in a substep.
+    let unit_j = model.scene.point_mass_kg() * (model.unit_m / plan.substep_s).powi(2);
+    let stiffness = model.scene.anchor_stiffness_n_per_m * model.unit_m * model.unit_m;
+    let energy = Energy {
+        kinetic_j: 0.5 * unit_j * survey.speed_squared,
+        spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
+        anchor_j: 0.5 * stiffness * survey.displacement_squared,
+    };
+    (energy, 0.5 * unit_j * survey.conserved_speed_squared + energy.spring_j + energy.anchor_j)
+}
 
-    /// Surveys part of the tissue. Returns the survey, the energies, and the energy that the scheme conserves;
-    /// both energies include that of the pressure, which belongs to the whole tissue.
-    pub(crate) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
-        let TissueState { model, plan, tables, state, .. } = self;
-        let terms = self.present_terms();
-        let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
-        let pressure_j = self.pressure_j(self.apply_volume_pressure());
-        let survey = Survey::of(tables, &plan.scheme, state, forces, over);
-        let (mut energy, kept_j) = self.energy_of(&survey);
-        energy.spring_j += pressure_j;
-        // A grasped point moves with its tool, not as the scheme would move it.
-        let own = self.prescribed.grasped().map(|(index, motion)| {
-            let [_, free, _] = self.free_point(index, self.applied.until(model, index));
-            model.relative_mass_at(index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
-        });
-        let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
-        energy.kinetic_j += grasped_j;
-        (survey, energy, kept_j + grasped_j + pressure_j)
-    }
-
-    /// Returns the energies of a survey, and the energy that the scheme conserves.
-    pub(crate) fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
-        let TissueState { model, plan, .. } = self;
-        // Twice the energy of a point that moves by a spacing in a substep.
-        let unit_j = model.scene.point_mass_kg() * (model.unit_m / plan.substep_s).powi(2);
-        let stiffness = model.scene.anchor_stiffness_n_per_m * model.unit_m * model.unit_m;
-        let energy = Energy {
-            kinetic_j: 0.5 * unit_j * survey.speed_squared,
-            spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
-            anchor_j: 0.5 * stiffness * survey.displacement_squared,
-        };
-        (energy, 0.5 * unit_j * survey.conserved_speed_squared + energy.spring_j + energy.anchor_j)
-    }
+/// Returns the energy of the pressure of a volume, J, from its growth in cubes of the unit of length.
+pub(crate) fn pressure_j(model: &Model, volume_change: f64) -> f64 {
+    let Some(volume) = model.places.volume() else { return 0.0 };
+    let unit_m = model.unit_m;
+    0.5 * model.scene.volume_stiffness_pa * volume.stretch_m * (volume_change * unit_m).powi(2)
 }

@@ -7,10 +7,12 @@
 
 use glam::DVec3;
 
+use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
+use crate::model::Model;
 use crate::state::saved::LARGEST;
-use crate::state::tissue_state::TissueState;
-use crate::tools::contact::Tool;
+use crate::tools::contact::{Contacts, Tool};
+use crate::tools::prescribed::Prescribed;
 use palpate_haptics::ContactState;
 
 fn is_sound(tool: &Tool) -> bool {
@@ -20,25 +22,29 @@ fn is_sound(tool: &Tool) -> bool {
     vectors.into_iter().all(|v: &DVec3| v.to_array().into_iter().all(|part| part.abs() < LARGEST))
 }
 
-impl<T: Real> TissueState<T> {
-    /// Returns the place in memory of a point that a tool has moved by `farthest` spacings or more, or of a
-    /// point under a tool whose own numbers are not finite. `None` if all is well.
-    pub(crate) fn broken_by_tools(&self, farthest: f64) -> Option<usize> {
-        let layout = &self.tables.layout;
-        let is_good = |index: &usize| {
-            (0..3).all(|c| {
-                let at = c * layout.plane + layout.offset(*index);
-                [self.state.u[at], self.state.d[at]].into_iter().all(|value| value.wide().abs() < farthest)
-            })
-        };
-        let of_tool = |tool: &Tool| -> Option<usize> {
-            let mut points = tool.points().map(|point| self.model.index_of(point));
-            if !is_sound(tool) {
-                return Some(points.next().unwrap_or(0));
-            }
-            if tool.contact_state == ContactState::Free { None } else { points.find(|index| !is_good(index)) }
-        };
-        let grasped = self.prescribed.grasped().map(|(index, _)| index).find(|index| !is_good(index));
-        grasped.or_else(|| self.contacts.tools.iter().find_map(of_tool))
-    }
+/// Returns the place in memory of a point that a tool has moved by `farthest` spacings or more, or of a point under a
+/// tool whose own numbers are not finite. `None` if all is well.
+pub(crate) fn broken_by_tools<T: Real>(
+    model: &Model,
+    layout: &Layout,
+    state: &State<T>,
+    prescribed: &Prescribed,
+    contacts: &Contacts,
+    farthest: f64,
+) -> Option<usize> {
+    let is_good = |index: &usize| {
+        (0..3).all(|c| {
+            let at = c * layout.plane + layout.offset(*index);
+            [state.u[at], state.d[at]].into_iter().all(|value| value.wide().abs() < farthest)
+        })
+    };
+    let of_tool = |tool: &Tool| -> Option<usize> {
+        let mut points = tool.points().map(|point| model.index_of(point));
+        if !is_sound(tool) {
+            return Some(points.next().unwrap_or(0));
+        }
+        if tool.contact_state == ContactState::Free { None } else { points.find(|index| !is_good(index)) }
+    };
+    let grasped = prescribed.grasped().map(|(index, _)| index).find(|index| !is_good(index));
+    grasped.or_else(|| contacts.tools.iter().find_map(of_tool))
 }

@@ -183,7 +183,7 @@ impl Binding<'_> {
 
     /// Returns a place on the tissue, m: [x, y] on a sheet, [x, y, z] on a mesh.
     fn place(&self, item: &Item<'_>) -> Result<DVec3> {
-        item.place_of(self.scene.shape().dimensions())
+        item.place_in(self.scene.shape().dimensions())
     }
 
     /// Reads changes of the tissue. Each is checked together with those before it.

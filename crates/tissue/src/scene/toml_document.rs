@@ -465,7 +465,7 @@ impl<'a> Item<'a> {
     ///
     /// # Errors
     /// Refuses a value that is not a list of so many numbers ([`Reason::WrongKind`]), and a number that is not finite.
-    pub fn place_of(&self, dimensions: usize) -> Result<DVec3> {
+    pub fn place_in(&self, dimensions: usize) -> Result<DVec3> {
         match dimensions {
             2 => Ok(self.place()?.extend(0.0)),
             _ => self.vector(),

@@ -17,21 +17,12 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::body::tables::springs_of;
-use crate::guard::checkpoint::Checkpoint;
-use crate::guard::convert;
-use crate::interface::Tissue;
-use crate::kernel::field::State;
-use crate::kernel::real::Real;
-use crate::memory;
 use crate::model::Model;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
 use crate::scheme::Oscillator;
-use crate::select::audit_window::{AuditWindow, Replay, Resume};
+use crate::select::audit_window::Replay;
 pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
-use crate::state::tissue_state::TissueState;
-use crate::tools::applied_force::Applied;
 
 /// How many substeps of the twin (the repetition in f64) usually replace one of the tissue: the argument
 /// `finer` of [`Audit::work`].
@@ -39,9 +30,6 @@ pub const FINER: u32 = 4;
 
 /// Longest window, s, before it is rounded up to the next checkpoint.
 const LONGEST_S: f64 = 0.25;
-
-/// Points times substeps in a slice of an audit, which takes some milliseconds.
-const SLICE: u64 = 1 << 20;
 
 /// The main source of an error that an audit measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -186,177 +174,6 @@ impl Model {
         let decay_per_s = if root > 0.0 { 2.0 * k / (c + root) } else { c / (2.0 * mass_kg) };
         let window_s = (std::f64::consts::LN_2 / decay_per_s).min(LONGEST_S);
         (window_s * self.scene.stepping.rate_hz).ceil().max(1.0) as u64
-    }
-}
-
-impl<T: Real> TissueState<T> {
-    /// Requests a window, which begins at the next checkpoint.
-    pub(crate) fn request_audit(&mut self, mut inputs: WindowInputs) {
-        inputs.0.clear();
-        (self.audit_window, self.is_marked) = (AuditWindow::Wanted(inputs), false);
-    }
-
-    /// Handles a new checkpoint, at which a window may begin or end.
-    pub(crate) fn mark(&mut self) {
-        self.audit_window = match std::mem::take(&mut self.audit_window) {
-            AuditWindow::Wanted(inputs) => {
-                self.is_marked = true;
-                AuditWindow::Open(self.steps + self.model.window_steps(), inputs)
-            }
-            // The beginning has not been reported yet, and its checkpoint is gone.
-            AuditWindow::Open(_, mut inputs) if self.is_marked => {
-                inputs.0.clear();
-                AuditWindow::Open(self.steps + self.model.window_steps(), inputs)
-            }
-            AuditWindow::Open(until, inputs) if self.steps >= until => AuditWindow::Closed(inputs),
-            AuditWindow::Closed(_) => AuditWindow::Dropped,
-            other => other,
-        };
-    }
-
-    /// Takes the report on the window, once.
-    pub(crate) fn take_mark(&mut self) -> Option<Mark> {
-        let share = |sheet: &Self| {
-            let checkpoint = sheet.checkpoint.clone()?;
-            Some(SharedCheckpoint { model: sheet.model.clone(), checkpoint })
-        };
-        match &self.audit_window {
-            AuditWindow::Open(..) if std::mem::take(&mut self.is_marked) => share(self).map(Mark::Begin),
-            AuditWindow::Closed(_) => {
-                let end = share(self);
-                let AuditWindow::Closed(inputs) = std::mem::take(&mut self.audit_window) else { return None };
-                Some(end.map_or(Mark::Dropped, |end| Mark::End(end, inputs)))
-            }
-            AuditWindow::Dropped => {
-                self.audit_window = AuditWindow::Off;
-                Some(Mark::Dropped)
-            }
-            _ => None,
-        }
-    }
-
-    /// Returns a tissue in the state of a checkpoint of a tissue with `model`.
-    fn resumed(model: &Model, checkpoint: &Checkpoint<T>) -> Box<Self> {
-        let mut sheet = Box::new(TissueState::new(&model.twin(1 << checkpoint.halvings, model.precision)));
-        sheet.steps = checkpoint.steps;
-        sheet.state.copy_from(&checkpoint.state);
-        sheet.applied.clone_from(&checkpoint.applied);
-        sheet.prescribed.clone_from(&checkpoint.prescribed);
-        sheet.contacts.clone_from(&checkpoint.contacts);
-        sheet.tiles.largest = checkpoint.largest;
-        sheet
-    }
-
-    /// Returns the same state in f64. `model` may differ from this tissue's only in the format and in what may
-    /// sleep.
-    pub(crate) fn widened(&self, model: &Arc<Model>) -> TissueState<f64> {
-        let mut sheet = TissueState::<f64>::new(model);
-        sheet.steps = self.steps;
-        let lost = (self.model.precision == Precision::Compensated).then(|| self.state.kept.last()).flatten();
-        let State { u, d, kept } = &mut sheet.state;
-        let pairs = [(u, &self.state.u), (d, &self.state.d)].into_iter();
-        let kept = kept.iter_mut().zip(&self.state.kept).map(|(to, from)| (Arc::make_mut(to), &**from));
-        let (from, to) = (self.tables.layout, sheet.tables.layout);
-        for (number, (wide, narrow)) in pairs.chain(kept).enumerate() {
-            for index in 0..self.model.place_count() {
-                for c in 0..3 {
-                    let at = c * from.plane + from.offset(index);
-                    // The rounding error of a compensated displacement belongs to it.
-                    let lost = lost.filter(|_| number == 0).map_or(0.0, |lost| lost[at].wide());
-                    wide[c * to.plane + to.offset(index)] = narrow[at].wide() + lost;
-                }
-            }
-        }
-        sheet.applied = Applied::like(&self.applied);
-        sheet.prescribed.clone_from(&self.prescribed);
-        sheet.contacts.clone_from(&self.contacts);
-        sheet
-    }
-
-    /// Returns the tissue under `model`, if that is in f64 and this one is not.
-    pub(crate) fn changed(&self, model: &Arc<Model>) -> Option<Box<TissueState<f64>>> {
-        if self.model.precision == Precision::F64 || model.precision != Precision::F64 {
-            return None;
-        }
-        let mut same = Model::clone(&self.model);
-        (same.plan, same.precision) = (self.plan.clone(), Precision::F64);
-        let mut sheet = Box::new(self.widened(&Arc::new(same)));
-        sheet.tiles.largest = self.tiles.largest;
-        sheet.guard_events = self.guard_events;
-        (sheet.substeps_done, sheet.points_done) = (self.substeps_done, self.points_done);
-        if !matches!(self.audit_window, AuditWindow::Off) {
-            sheet.audit_window = AuditWindow::Dropped;
-        }
-        sheet.change(model);
-        Some(sheet)
-    }
-
-    /// Continues with another substep of the same scheme. The springs and the scheme's history stay.
-    pub(crate) fn resample(&mut self, model: &Arc<Model>) {
-        let (was, plan) = (self.plan.clone(), model.plan.clone());
-        // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
-        self.applied.terms = self.present_terms();
-        let springs = springs_of(&self.model, &was);
-        let volume_change = self.volume_change();
-        convert(&self.tables.layout, &springs, [&was, &plan], &self.applied, volume_change, &mut self.state);
-        self.known_volume_change.set(None);
-        self.applied.forget();
-        self.model = model.clone();
-        self.tables.springs = springs_of(model, &plan);
-        self.plan = plan;
-    }
-}
-
-impl<T: Real> Resume for Checkpoint<T> {
-    fn resume(&self, model: &Model) -> Box<dyn Replay> {
-        TissueState::resumed(model, self)
-    }
-}
-
-impl<T: Real> Replay for TissueState<T> {
-    fn model(&self) -> &Arc<Model> {
-        &self.model
-    }
-
-    fn steps(&self) -> u64 {
-        self.steps
-    }
-
-    fn largest(&self) -> f64 {
-        self.tiles.largest
-    }
-
-    fn observed(&self) -> Vec<[DVec3; 2]> {
-        let points = self.model.points().map(|point| {
-            let point = self.point(point);
-            [point.displacement_m, point.reaction_n()]
-        });
-        memory::collected(points, "an audit")
-    }
-
-    fn twin(&self, by: u32) -> Box<dyn Replay> {
-        let mut wide = self.widened(&self.model.twin(1, Precision::F64));
-        if by > 1 {
-            let model = wide.model.twin(by, Precision::F64);
-            wide.resample(&model);
-        }
-        Box::new(wide)
-    }
-
-    fn repeat(&mut self, inputs: &WindowInputs, until: u64, go_on: &mut dyn FnMut() -> bool) -> bool {
-        let work = self.model.len() as u64 * u64::from(self.plan.substeps);
-        let slice = (SLICE / work).max(1);
-        let mut waiting = inputs.0.iter().peekable();
-        while self.steps < until {
-            while let Some((_, tool, input)) = waiting.next_if(|(step, ..)| *step <= self.steps) {
-                self.tell(*tool, input.clone());
-            }
-            self.do_step();
-            if self.steps.is_multiple_of(slice) && !go_on() {
-                return false;
-            }
-        }
-        true
     }
 }
 

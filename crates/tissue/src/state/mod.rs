@@ -1,9 +1,12 @@
-//! The state of a tissue: stepping, copying, saving, restoring, and changing to another model.
+//! The state of a tissue: its step, its readings, what changes it otherwise, its copies, and how it is saved and restored.
 
-pub(crate) mod change;
-pub(crate) mod copy;
+pub(crate) mod context;
+mod copy;
+mod guarded;
+pub(crate) mod profile;
 pub(crate) mod restore;
 pub mod saved;
+mod step;
 #[cfg(test)]
 mod subnormal;
 pub(crate) mod tissue_state;

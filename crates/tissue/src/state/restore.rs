@@ -9,7 +9,8 @@ use std::sync::Arc;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::tables::springs_of;
-use crate::guard::checkpoint::{Checkpoint, Input, Work};
+use crate::guard::checkpoint::{Checkpoint, Input};
+use crate::guard::work::Work;
 use crate::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
@@ -22,7 +23,7 @@ use crate::scene::{Named, Precision};
 use crate::sleep::tiles::TakenTiles;
 use crate::state::saved::{
     Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedPrescribed, SavedState,
-    SavedTissue, TissueParts, ensure, unsound,
+    TissueParts, ensure, unsound,
 };
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
@@ -42,9 +43,9 @@ pub fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: 
     fits(model, parts)?;
     memory::attempt(SNAPSHOT, || {
         Ok(match model.precision {
-            Precision::F64 => Box::new(TissueState::<f64>::restored(model, parts, values, limits)?) as Box<dyn Tissue>,
+            Precision::F64 => Box::new(restored_as::<f64>(model, parts, values, limits)?) as Box<dyn Tissue>,
             Precision::Auto | Precision::F32 | Precision::Compensated => {
-                Box::new(TissueState::<f32>::restored(model, parts, values, limits)?)
+                Box::new(restored_as::<f32>(model, parts, values, limits)?)
             }
         })
     })
@@ -116,22 +117,22 @@ impl Model {
 
 /// A copy of a tissue, with values in one number format.
 #[derive(Debug)]
-struct TypedState<T: Real> {
-    model: Arc<Model>,
-    layout: Layout,
-    steps: u64,
-    halvings: u32,
-    state: State<T>,
-    forces: SavedForces,
-    prescribed: SavedPrescribed,
-    contacts: Vec<SavedContact>,
-    work: Work,
-    checkpoint: Option<Arc<Checkpoint<T>>>,
-    inputs: Vec<(u64, usize, Input)>,
-    tiles: TakenTiles<T>,
-    guard_events: u64,
-    substeps_done: u64,
-    points_done: u64,
+pub(super) struct TypedState<T: Real> {
+    pub(super) model: Arc<Model>,
+    pub(super) layout: Layout,
+    pub(super) steps: u64,
+    pub(super) halvings: u32,
+    pub(super) state: State<T>,
+    pub(super) forces: SavedForces,
+    pub(super) prescribed: SavedPrescribed,
+    pub(super) contacts: Vec<SavedContact>,
+    pub(super) work: Work,
+    pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
+    pub(super) inputs: Vec<(u64, usize, Input)>,
+    pub(super) tiles: TakenTiles<T>,
+    pub(super) guard_events: u64,
+    pub(super) substeps_done: u64,
+    pub(super) points_done: u64,
 }
 
 impl<T: Real> SavedState for TypedState<T> {
@@ -199,122 +200,105 @@ fn halved(model: &Model, halvings: u32) -> Plan {
     if halvings == 0 { model.plan.clone() } else { model.plan.divided(&model.scene, 1 << halvings) }
 }
 
-impl<T: Real> TissueState<T> {
-    /// Returns a copy of everything that the next steps depend on. It shares the checkpoint, so that the next
-    /// checkpoint takes new memory.
-    pub(crate) fn save(&self) -> SavedTissue {
-        let TissueState { model, tables, state, tiles, .. } = self;
-        let mut state_copy = State::zero(&tables.layout, state.kept.len());
-        state_copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
-        SavedTissue(Arc::new(TypedState {
-            model: model.clone(),
-            layout: tables.layout,
-            steps: self.steps,
-            halvings: self.halvings,
-            state: state_copy,
-            forces: self.applied.saved(),
-            prescribed: self.prescribed.saved(),
-            contacts: self.contacts.saved(),
-            work: self.work,
-            checkpoint: self.checkpoint.clone(),
-            inputs: self.inputs.clone(),
-            tiles: tiles.taken(),
-            guard_events: self.guard_events,
-            substeps_done: self.substeps_done,
-            points_done: self.points_done,
-        }))
-    }
+fn restored_as<T: Real>(
+    model: &Arc<Model>,
+    parts: &TissueParts,
+    values: &[u8],
+    limits: &Limits,
+) -> Result<TissueState<T>> {
+    let checks = Checks { shape: model.shape(), limits };
+    let mut sheet = TissueState::new(model);
+    sheet.steps = checks.count(parts.steps)?;
+    ensure(parts.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
+    sheet.halvings = parts.halvings;
+    sheet.plan = halved(model, parts.halvings);
+    sheet.tables.springs = springs_of(model, &sheet.plan);
+    sheet.guard_events = checks.count(parts.guard_events)?;
+    // Points times substeps may exceed the limit of steps.
+    ensure(parts.substeps_done.max(parts.points_done) < u64::MAX / 4, "a count beyond what any session has")?;
+    (sheet.substeps_done, sheet.points_done) = (parts.substeps_done, parts.points_done);
 
-    fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: &Limits) -> Result<Self> {
-        let checks = Checks { shape: model.shape(), limits };
-        let mut sheet = TissueState::new(model);
-        sheet.steps = checks.count(parts.steps)?;
-        ensure(parts.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
-        sheet.halvings = parts.halvings;
-        sheet.plan = halved(model, parts.halvings);
-        sheet.tables.springs = springs_of(model, &sheet.plan);
-        sheet.guard_events = checks.count(parts.guard_events)?;
-        // Points times substeps may exceed the limit of steps.
-        ensure(parts.substeps_done.max(parts.points_done) < u64::MAX / 4, "a count beyond what any session has")?;
-        (sheet.substeps_done, sheet.points_done) = (parts.substeps_done, parts.points_done);
+    let layout = sheet.tables.layout;
+    let scale = sheet.plan.force_scale(&model.scene);
+    sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
+    sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
+    sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
+    sheet.work = Work::restored(&parts.work)?;
+    sheet.tiles.restore(&parts.tiles)?;
 
-        let layout = sheet.tables.layout;
-        let scale = sheet.plan.force_scale(&model.scene);
-        sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
-        sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
-        sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
-        sheet.work = Work::restored(&parts.work)?;
-        sheet.tiles.restore(&parts.tiles)?;
-
-        let size = size_of::<T>();
-        ensure(values.len().is_multiple_of(size), "part of a value")?;
-        let mut values = values.chunks_exact(size).map(T::read);
-        let moved: Vec<usize> = parts.tiles.moved.iter().map(|tile| *tile as usize).collect();
-        // Far beyond what the guard allows a point in an interval. The guard finds an impossible state at the
-        // next step.
-        let most = T::of(T::LARGEST);
-        let mut fill = |state: &mut State<T>| -> Result<bool> {
-            let mut any = false;
-            for tile in &moved {
-                for field in state.fields_mut() {
-                    for row in rows_of(&layout, *tile) {
-                        for value in &mut field[row] {
-                            *value = values.next().ok_or_else(|| unsound("too few values"))?;
-                            ensure(value.magnitude() < most, "a value that is not finite or out of range")?;
-                            any |= *value != T::default();
-                        }
+    let size = size_of::<T>();
+    ensure(values.len().is_multiple_of(size), "part of a value")?;
+    let mut values = values.chunks_exact(size).map(T::read);
+    let moved: Vec<usize> = parts.tiles.moved.iter().map(|tile| *tile as usize).collect();
+    // Far beyond what the guard allows a point in an interval. The guard finds an impossible state at the
+    // next step.
+    let most = T::of(T::LARGEST);
+    let mut fill = |state: &mut State<T>| -> Result<bool> {
+        let mut any = false;
+        for tile in &moved {
+            for field in state.fields_mut() {
+                for row in rows_of(&layout, *tile) {
+                    for value in &mut field[row] {
+                        *value = values.next().ok_or_else(|| unsound("too few values"))?;
+                        ensure(value.magnitude() < most, "a value that is not finite or out of range")?;
+                        any |= *value != T::default();
                     }
                 }
             }
-            Ok(any)
-        };
+        }
+        Ok(any)
+    };
+    let mut state = State::zero(&layout, sheet.state.kept.len());
+    let is_moved = fill(&mut state)?;
+    sheet.state = state;
+    // Computes what each tile adds to the volume; sleeping tiles are not added up again later.
+    let tiles: Vec<usize> = (0..sheet.tiles.tile_count()).collect();
+    sheet.tables.volume_change(&sheet.state.u, &tiles);
+    let checkpoint = parts.checkpoint.as_ref().map(|saved| {
         let mut state = State::zero(&layout, sheet.state.kept.len());
-        let is_moved = fill(&mut state)?;
-        sheet.state = state;
-        // Computes what each tile adds to the volume; sleeping tiles are not added up again later.
-        let tiles: Vec<usize> = (0..sheet.tiles.tile_count()).collect();
-        sheet.tables.volume_change(&sheet.state.u, &tiles);
-        let checkpoint = parts.checkpoint.as_ref().map(|saved| {
-            let mut state = State::zero(&layout, sheet.state.kept.len());
-            fill(&mut state)?;
-            sheet.checkpoint_of(saved, state, &checks)
-        });
-        sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
-        sheet.tiles.remember_again(&mut values)?;
-        ensure(values.next().is_none(), "too many values")?;
+        fill(&mut state)?;
+        checkpoint_of(&sheet, saved, state, &checks)
+    });
+    sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
+    sheet.tiles.remember_again(&mut values)?;
+    ensure(values.next().is_none(), "too many values")?;
 
-        let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
-        for (step, tool, input) in &parts.inputs {
-            ensure((from..=sheet.steps).contains(step), "an input at a step before its checkpoint or after its end")?;
-            sheet.inputs.push((*step, checks.tool(*tool)?, Input::restored(input, model, &checks)?));
-        }
-        ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;
-        if sheet.checkpoint.is_none() {
-            // A moving tissue has a state to go back to, from its first input on.
-            let is_idle = sheet.is_still() || !is_moved && sheet.applied.is_settled() && sheet.contacts.is_empty();
-            ensure(is_idle && sheet.prescribed.is_empty() && sheet.inputs.is_empty(), "no state to go back to")?;
-            sheet.state.share_equal_history(sheet.plan.scheme.history());
-        }
-        Ok(sheet)
+    let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
+    for (step, tool, input) in &parts.inputs {
+        ensure((from..=sheet.steps).contains(step), "an input at a step before its checkpoint or after its end")?;
+        sheet.inputs.push((*step, checks.tool(*tool)?, Input::restored(input, model, &checks)?));
     }
+    ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;
+    if sheet.checkpoint.is_none() {
+        // A moving tissue has a state to go back to, from its first input on.
+        let is_idle = sheet.is_at_rest() || !is_moved && sheet.applied.is_settled() && sheet.contacts.is_empty();
+        ensure(is_idle && sheet.prescribed.is_empty() && sheet.inputs.is_empty(), "no state to go back to")?;
+        sheet.state.share_equal_history(sheet.plan.scheme.history());
+    }
+    Ok(sheet)
+}
 
-    fn checkpoint_of(&self, saved: &SavedCheckpoint, state: State<T>, checks: &Checks<'_>) -> Result<Checkpoint<T>> {
-        let (model, layout) = (&self.model, &self.tables.layout);
-        let is_recent = saved.steps <= self.steps && self.steps - saved.steps <= INTERVAL_SUBSTEPS;
-        ensure(is_recent, "a state to go back to that is too old")?;
-        ensure(saved.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
-        ensure((0.0..f64::INFINITY).contains(&saved.largest), "a displacement that is not finite")?;
-        let scale = halved(model, saved.halvings).force_scale(&model.scene);
-        Ok(Checkpoint {
-            steps: saved.steps,
-            halvings: saved.halvings,
-            state,
-            applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
-            prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
-            contacts: Contacts::restored(&saved.contacts, model, checks)?,
-            work: Work::restored(&saved.work)?,
-            largest: saved.largest,
-            passed_checks: saved.passed_checks,
-        })
-    }
+fn checkpoint_of<T: Real>(
+    tissue: &TissueState<T>,
+    saved: &SavedCheckpoint,
+    state: State<T>,
+    checks: &Checks<'_>,
+) -> Result<Checkpoint<T>> {
+    let (model, layout) = (&tissue.model, &tissue.tables.layout);
+    let is_recent = saved.steps <= tissue.steps && tissue.steps - saved.steps <= INTERVAL_SUBSTEPS;
+    ensure(is_recent, "a state to go back to that is too old")?;
+    ensure(saved.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
+    ensure((0.0..f64::INFINITY).contains(&saved.largest), "a displacement that is not finite")?;
+    let scale = halved(model, saved.halvings).force_scale(&model.scene);
+    Ok(Checkpoint {
+        steps: saved.steps,
+        halvings: saved.halvings,
+        state,
+        applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
+        prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
+        contacts: Contacts::restored(&saved.contacts, model, checks)?,
+        work: Work::restored(&saved.work)?,
+        largest: saved.largest,
+        passed_checks: saved.passed_checks,
+    })
 }

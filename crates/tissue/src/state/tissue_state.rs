@@ -1,4 +1,4 @@
-//! A tissue in motion: its state, the step that advances it, and what can be read from it.
+//! A tissue in motion: its state, and what can be read from it. `step` advances it, `guarded` changes it otherwise.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -8,26 +8,32 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::tables::{SweepTables, springs_of};
-use crate::guard::checkpoint::{Checkpoint, Input, Repetition, Work};
+use crate::body::window::Window;
+use crate::guard::checkpoint::{Checkpoint, Input, Repetition};
+use crate::guard::survey::{Forces, Survey, energy_of, pressure_j};
+use crate::guard::work::Work;
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::lanes::Scalar;
 use crate::kernel::real::Real;
+use crate::kernel::region::Region;
+use crate::memory;
 use crate::model::{Model, Plan};
+use crate::response::around_place::reaction_around;
 use crate::scene::Precision;
-use crate::scene::profile::{Moment, Motion, Poke};
+use crate::scene::profile::{Moment, Poke};
 use crate::scheme::arithmetic::MAX_KEPT;
-use crate::scheme::each;
-use crate::scheme::family::{Family, Release};
 use crate::scheme::observer::Observer;
 use crate::select::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::shape::PointId;
-use crate::sleep::tiles::{CHECK_STEPS, SleepTiles};
+use crate::sleep::criterion::add_sleeping;
+use crate::sleep::tiles::SleepTiles;
+use crate::state::profile::{Profile, StepStage};
 use crate::state::saved::SavedTissue;
-use crate::tools::applied_force::{Applied, Push};
-use crate::tools::contact::{Contacts, TangentInput, ToolContact};
+use crate::tools::applied_force::{Applied, Push, Term};
+use crate::tools::contact::{Contacts, TangentInput, Tool, ToolContact, displacement_m};
 use crate::tools::prescribed::{Grasp, Prescribed};
-use palpate_haptics::Tip;
+use palpate_haptics::{ContactState, Tip};
 
 /// Creates a tissue at rest, at step 0 and without tools, in the number format of the model: f64 for
 /// [`Precision::F64`], otherwise f32. Unwinds with a refusal if there is no memory for its state
@@ -41,33 +47,35 @@ pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
 
 #[derive(Debug)]
 pub(crate) struct TissueState<T: Real> {
-    pub(crate) model: Arc<Model>,
+    pub(super) model: Arc<Model>,
     /// The model's plan, or one with a shorter substep.
-    pub(crate) plan: Plan,
-    pub(crate) halvings: u32,
-    pub(crate) tables: SweepTables<T>,
-    pub(crate) state: State<T>,
-    pub(crate) applied: Applied<T>,
-    pub(crate) prescribed: Prescribed,
-    pub(crate) contacts: Contacts,
-    pub(crate) steps: u64,
-    pub(crate) work: Work,
+    pub(super) plan: Plan,
+    pub(super) halvings: u32,
+    pub(super) tables: SweepTables<T>,
+    pub(super) state: State<T>,
+    pub(super) applied: Applied<T>,
+    pub(super) prescribed: Prescribed,
+    pub(super) contacts: Contacts,
+    pub(super) steps: u64,
+    pub(super) work: Work,
     /// `None` means the present state. A tissue at rest needs no copy.
-    pub(crate) checkpoint: Option<Arc<Checkpoint<T>>>,
+    pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
-    pub(crate) inputs: Vec<(u64, usize, Input)>,
+    pub(super) inputs: Vec<(u64, usize, Input)>,
     /// A repetition by the guard; until it ends, the present step is unfinished.
-    pub(crate) repetition: Option<Repetition>,
-    pub(crate) audit_window: AuditWindow,
+    pub(super) repetition: Option<Repetition>,
+    pub(super) audit_window: AuditWindow,
     /// Whether the beginning of the window is still to be reported.
-    pub(crate) is_marked: bool,
-    pub(crate) tiles: SleepTiles<T>,
-    pub(crate) guard_events: u64,
-    pub(crate) substeps_done: u64,
+    pub(super) is_marked: bool,
+    pub(super) tiles: SleepTiles<T>,
+    pub(super) guard_events: u64,
+    pub(super) substeps_done: u64,
     /// Points computed, summed over all substeps.
-    pub(crate) points_done: u64,
+    pub(super) points_done: u64,
     /// By how much a volume has grown, if it was computed since the last change of the state.
-    pub(crate) known_volume_change: Cell<Option<f64>>,
+    pub(super) known_volume_change: Cell<Option<f64>>,
+    /// How long the stages of a step take, if that is asked for.
+    pub(super) profile: Option<Profile>,
 }
 
 impl<T: Real> TissueState<T> {
@@ -94,162 +102,88 @@ impl<T: Real> TissueState<T> {
             substeps_done: 0,
             points_done: 0,
             known_volume_change: Cell::new(None),
+            profile: None,
             plan,
         }
     }
 
-    pub(crate) fn do_step(&mut self) {
-        if self.is_still() {
-            return self.skip_steps(1);
-        }
-        self.known_volume_change.set(None);
-        let substeps = self.plan.substeps;
-        self.substeps_done += u64::from(substeps);
-        self.wake_what_is_pushed();
-        let fraction = |substep: u32| f64::from(substep) / f64::from(substeps);
-        for substep in 0..substeps {
-            self.substep(Moment { step: self.steps, fraction: fraction(substep) }, fraction(substep + 1));
-        }
-        self.applied.finish(&self.model, self.steps);
-        self.prescribed.finish(&self.model, self.steps);
-        self.contacts.finish(self.model.scene.stepping.rate_hz);
-        self.steps += 1;
-        if self.steps.is_multiple_of(CHECK_STEPS) {
-            self.put_to_sleep();
+    /// Returns by how much the volume of a mesh has grown, in cubes of the unit of length.
+    pub(super) fn volume_change(&self) -> f64 {
+        let fresh = || self.tables.volume_change(&self.state.u, self.tiles.region.tiles());
+        self.known_volume_change.get().unwrap_or_else(fresh)
+    }
+
+    /// Keeps the growth of a volume until the state changes: reading many points computes it once.
+    fn keep_growth(&self) {
+        if self.tables.pressure.is_some() && self.known_volume_change.get().is_none() {
+            self.known_volume_change.set(Some(self.volume_change()));
         }
     }
 
-    /// Advances from `moment` to the fraction `end` of the same step.
-    fn substep(&mut self, moment: Moment, end: f64) {
-        let far = self.tiles.wake_threshold(&self.model.scene);
-        self.tiles.wake_beside_moved([&self.state.u, &self.state.d], self.plan.scheme.sweeps(), far);
-        self.wake_what_is_moved(moment, end, far);
-        if self.tables.pressure.is_some() {
-            let volume_change = self.apply_volume_pressure();
-            self.wake_what_is_pressed(volume_change, far);
-        }
-        self.points_done += self.tiles.awake_points as u64;
-        let TissueState { model, plan, tables, applied, .. } = self;
-        applied.prepare(model, plan, &tables.layout, moment, end - moment.fraction);
-        let released = self.prescribed.take_released();
-        let released: Vec<_> = released
-            .into_iter()
-            .filter_map(|(index, v)| Some((index, self.change_at_release(index, v, moment)?)))
-            .collect();
-        // A scheme that takes means adds the change to the substep's increment; other schemes add it to the
-        // initial state.
-        let takes_means = self.plan.scheme.takes_means();
-        if !takes_means {
-            released.iter().for_each(|(index, change)| self.shift(*index, change));
-        }
-        for sweep in 0..self.plan.scheme.sweeps() {
-            if self.tables.pressure.is_some() && (sweep > 0 || !released.is_empty()) {
-                self.apply_volume_pressure();
-            }
-            self.sweep(sweep);
-            if let Some(far) = self.plan.scheme.fraction_after(sweep) {
-                self.apply_prescribed(moment.step, moment.fraction + far * (end - moment.fraction), false);
-            }
-        }
-        let history = self.plan.scheme.history();
-        if history > 0 {
-            // The newest force takes the place of the oldest.
-            self.state.kept[..history].rotate_right(1);
-        }
-        if takes_means {
-            released.iter().for_each(|(index, change)| self.shift(*index, change));
-        }
-        let unit_j = self.unit_of_work_j();
-        self.work.add(self.tables.take_work() * unit_j);
-        self.apply_prescribed(moment.step, end, true);
-        self.solve_contact(end, far);
+    /// Returns whether no point moves and no tool can change that.
+    pub(super) fn is_at_rest(&self) -> bool {
+        self.tiles.region.tiles().is_empty()
+            && self.applied.is_settled()
+            && self.prescribed.is_empty()
+            && self.contacts.is_empty()
     }
 
-    /// Runs sweep number `sweep` of a substep.
-    fn sweep(&mut self, sweep: usize) {
-        let TissueState { model, plan, tables, state, applied, tiles, .. } = self;
-        let (field, terms, region) = (plan.scheme.field(sweep), &applied.terms, &tiles.region);
-        // Separate calls, so that the compiler leaves out what a format does not need.
-        #[allow(clippy::collapsible_if)]
-        if const { T::COMPENSATES } {
-            if model.precision == Precision::Compensated {
-                return each!(&plan.scheme, |family| {
-                    tables.advance(&family.compensated::<T>(sweep), state, terms, field, region);
-                });
-            }
-        }
-        each!(&plan.scheme, |family| tables.advance(&family.plain::<T>(sweep), state, terms, field, region));
+    /// Passes steps in which nothing moves.
+    pub(super) fn pass_steps(&mut self, steps: u64) {
+        self.steps += steps;
+        self.substeps_done += steps * u64::from(self.plan.substeps);
     }
 
-    /// Moves the grasped points to their places at `fraction` of the step, and counts the work if `counted`.
-    fn apply_prescribed(&mut self, step: u64, fraction: f64, counted: bool) {
-        let unit_j = self.unit_of_work_j();
-        let TissueState { model, plan, tables, state, applied, prescribed, work, .. } = self;
-        let spacing_m = model.unit_m;
-        for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
-            let (mut product, mut moved) = (0.0, [0.0; 3]);
-            for c in 0..3 {
-                let at = c * tables.layout.plane + tables.layout.offset(index);
-                let (free_u, free_d) = (state.u[at], state.d[at]);
-                state.u[at] = T::of(displacement_m[c] / spacing_m);
-                state.d[at] = if plan.scheme.takes_means() {
-                    // Undo the scheme's own movement: the increment starts from where the point was before.
-                    state.u[at] - (free_u - free_d)
-                } else {
-                    T::of(velocity_m_per_s[c] * plan.substep_s / spacing_m)
-                };
-                product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
-                moved[c] = state.u[at].wide() - free_u.wide();
-            }
-            if counted {
-                work.add(product * model.relative_mass_at(index) * unit_j);
-                work.add(applied.work_along(model, plan, &tables.layout, model.point_of(index), moved) * unit_j);
-            }
-        }
+    /// Returns the place of the displaced surface under a tool, m.
+    fn surface_m(&self, tool: &Tool) -> DVec3 {
+        tool.footprint.surface(|point| displacement_m(&self.model, &self.tables.layout, &self.state, point)).0
     }
 
-    /// Returns the change of u and d of a point that is released with `velocity_m_per_s`; `None` if nothing
-    /// must change.
-    fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> Option<[[f64; 2]; 3]> {
-        let TissueState { model, plan, tables, state, applied, .. } = self;
-        let (point, scene) = (model.point_of(index), &model.scene);
-        let springs = tables.springs.gather(&tables.layout, &state.u, self.volume_change(), point).map(Real::wide);
-        let scale = plan.force_scale(scene);
-        let applied_n = applied.from(model, index, moment);
-        let (used, mass) = (applied.force_at(&tables.layout, 0, point), model.relative_mass_at(index));
-        let mut changes = [[0.0; 2]; 3];
-        for (c, change) in changes.iter_mut().enumerate() {
-            let at = c * tables.layout.plane + tables.layout.offset(index);
-            *change = plan.scheme.release(Release {
-                u: state.u[at].wide(),
-                springs: &state.history(springs[c], plan.scheme.history(), at),
-                used: used[c],
-                scale,
-                lost_n: scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c] / mass,
-            })?;
-        }
-        Some(changes)
+    /// Returns the force on a free point but for tips and inertia, N: that of springs, anchor springs, damping and
+    /// force-controlled tools.
+    fn force_on_free(&self, index: usize, mass: f64) -> DVec3 {
+        let scene = &self.model.scene;
+        let of_stiffness = self.model.relative_anchor_stiffness_at(index);
+        let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(&self.model, index) };
+        let [u, v, spring_n] = self.free_point(index, applied_n);
+        let anchor_n = -of_stiffness * scene.anchor_stiffness_n_per_m * u;
+        let damping_n = -mass * scene.damping_n_s_per_m * v;
+        spring_n + anchor_n + damping_n + applied_n
     }
 
-    /// Adds `change` to u and d of a point.
-    fn shift(&mut self, index: usize, change: &[[f64; 2]; 3]) {
-        let TissueState { tables, state, .. } = self;
-        for (c, change) in change.iter().enumerate() {
-            let at = c * tables.layout.plane + tables.layout.offset(index);
-            state.u[at] += T::of(change[0]);
-            state.d[at] += T::of(change[1]);
+    /// Returns the tools' force at the end of the last step, in the springs' units, if the scheme needs it to
+    /// observe a velocity; otherwise nothing.
+    pub(super) fn present_terms(&self) -> Vec<Term<T>> {
+        let TissueState { model, plan, tables, .. } = self;
+        if !plan.scheme.takes_means() || self.steps == 0 {
+            return Vec::new();
         }
+        self.applied.until_now(model, &tables.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
     }
 
-    /// Returns the work of a force of 1 in the fields of the tools along a displacement of 1, J.
-    pub(crate) fn unit_of_work_j(&self) -> f64 {
-        let TissueState { model, plan, .. } = self;
-        model.unit_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
+    /// Surveys part of the tissue. Returns the survey, the energies, and the energy that the scheme conserves;
+    /// both energies include that of the pressure, which belongs to the whole tissue.
+    pub(super) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
+        let TissueState { model, plan, tables, state, .. } = self;
+        let terms = self.present_terms();
+        let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
+        let pressure_j = pressure_j(model, tables.press(&state.u, self.tiles.region.tiles()));
+        let survey = Survey::of(tables, &plan.scheme, state, forces, over);
+        let (mut energy, kept_j) = energy_of(model, plan, &survey);
+        energy.spring_j += pressure_j;
+        // A grasped point moves with its tool, not as the scheme would move it.
+        let own = self.prescribed.grasped().map(|(index, motion)| {
+            let [_, free, _] = self.free_point(index, self.applied.until(model, index));
+            model.relative_mass_at(index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
+        });
+        let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
+        energy.kinetic_j += grasped_j;
+        (survey, energy, kept_j + grasped_j + pressure_j)
     }
 
     /// Returns displacement, velocity and springs' force of a free point, under the applied force `applied_n`
     /// and that of tips.
-    pub(crate) fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
+    fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
         let TissueState { model, plan, tables, state, .. } = self;
         let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
         let unit = plan.scheme.spring_scale() * scale;
@@ -273,45 +207,10 @@ impl<T: Real> TissueState<T> {
             let [u, w, _] = observer.observe(u, d, n, &kept, Some(force));
             found[0][c] = u.0 * spacing_m;
             found[1][c] = if still { 0.0 } else { w.0 * spacing_m / plan.substep_s };
-            found[2][c] = spring_force_n(model, plan, index, n.0, state.u[at].wide());
+            found[2][c] = plan.spring_force_n(model, index, n.0, state.u[at].wide());
         }
         found
     }
-
-    pub(crate) fn tell(&mut self, tool: usize, input: Input) {
-        match input {
-            Input::Push(push) => {
-                self.prescribed.release(tool);
-                self.contacts.release(tool);
-                self.applied.set(tool, push);
-            }
-            Input::Pose(place_m, tip) => {
-                self.prescribed.release(tool);
-                self.applied.set(tool, None);
-                self.contacts.pose(&self.model, tool, place_m, tip);
-            }
-            Input::Grasp(index, grasp) => {
-                self.applied.set(tool, None);
-                self.contacts.release(tool);
-                self.tiles.wake_under([self.model.point_of(index)]);
-                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(self.model.point_at(index));
-                let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
-                self.prescribed.grasp(tool, index, grasp, now);
-            }
-        }
-    }
-}
-
-/// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables and the
-/// displacement in spacings.
-pub(crate) fn spring_force_n(model: &Model, plan: &Plan, index: usize, gathered: f64, u: f64) -> f64 {
-    let force_n = gathered / (plan.scheme.spring_scale() * plan.force_scale(&model.scene));
-    if !model.places.differ() {
-        return force_n;
-    }
-    // Anchor stiffness beyond the reference K″ is not part of the springs.
-    let pulled_n = model.scene.anchor_stiffness_n_per_m * model.extra_anchor_at(index) * u * model.unit_m;
-    model.relative_mass_at(index) * (force_n + pulled_n)
 }
 
 impl<T: Real> Tissue for TissueState<T> {
@@ -353,11 +252,20 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn tool_contact(&self, tool: usize) -> Option<ToolContact> {
         self.keep_growth();
-        TissueState::tool_contact(self, tool)
+        let tool = self.contacts.tool(tool)?;
+        let without_inertia = || tool.without_inertia(&self.model, |index, mass| self.force_on_free(index, mass));
+        Some(tool.contact(self.surface_m(tool), without_inertia))
     }
 
     fn tangent_input(&self, tool: usize) -> Option<TangentInput> {
-        TissueState::tangent_input(self, tool)
+        let tool = self.contacts.tool(tool).filter(|tool| tool.contact_state != ContactState::Free)?;
+        let window = Window::around(&self.model, &tool.footprint);
+        // Without memory for it, the stiffness from the force law must suffice.
+        memory::check(window.bytes(), "the stiffness under a tool").ok()?;
+        let displacement =
+            |index: usize| displacement_m(&self.model, &self.tables.layout, &self.state, self.model.point_of(index));
+        let displacement_m = window.points(&self.model).map(displacement).collect();
+        Some(TangentInput { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
     }
 
     fn release(&mut self, tool: usize) {
@@ -365,52 +273,33 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn change(&mut self, model: &Arc<Model>) {
-        self.known_volume_change.set(None);
-        TissueState::change(self, model);
-        self.known_volume_change.set(None);
+        self.exchange_model(model);
     }
 
     fn request_audit(&mut self, inputs: WindowInputs) {
-        TissueState::request_audit(self, inputs);
+        self.begin_window(inputs);
     }
 
     fn take_mark(&mut self) -> Option<Mark> {
-        TissueState::take_mark(self)
+        self.report_window()
     }
 
     fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>> {
-        TissueState::changed(self, model).map(|sheet| sheet as Box<dyn Tissue>)
+        self.in_f64(model).map(|sheet| sheet as Box<dyn Tissue>)
     }
 
     fn is_still(&self) -> bool {
-        self.tiles.region.tiles().is_empty()
-            && self.applied.is_settled()
-            && self.prescribed.is_empty()
-            && self.contacts.is_empty()
+        self.is_at_rest()
     }
 
     fn skip_steps(&mut self, steps: u64) {
-        self.steps += steps;
-        self.substeps_done += steps * u64::from(self.plan.substeps);
+        self.pass_steps(steps);
     }
 
     fn step_while(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp> {
-        if self.repetition.is_none() {
-            self.do_step();
-            if (self.checkpoint.is_some() || !self.is_still())
-                && let Err(cause) = self.check()
-            {
-                self.begin_repetition(cause)?;
-            }
-        }
-        if !self.go_on_repeating(may_go_on)? {
-            return Ok(false);
-        }
-        if self.checkpoint.is_some() && self.is_still() {
-            self.forget_checkpoint();
-        }
-        self.known_volume_change.set(None);
-        Ok(true)
+        let is_done = self.guarded_step(may_go_on);
+        self.ended(StepStage::Guard);
+        is_done
     }
 
     fn is_within_step(&self) -> bool {
@@ -418,19 +307,20 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn recover(&mut self, step: u64, to_rest: bool) -> Released {
-        self.known_volume_change.set(None);
-        let released = TissueState::recover(self, step, to_rest);
-        self.known_volume_change.set(None);
-        released
+        self.go_on_after_blow_up(step, to_rest)
     }
 
     fn surface_displacement_m(&self, place_m: DVec3) -> DVec3 {
-        self.surface_displacement(place_m)
+        let displacement_m = |point| {
+            let place = self.model.point_of(self.model.place_of(point));
+            displacement_m(&self.model, &self.tables.layout, &self.state, place)
+        };
+        self.model.shape().interpolate(place_m, &displacement_m)
     }
 
     fn reaction_around_n(&self, poke: &Poke) -> DVec3 {
         self.keep_growth();
-        self.reaction_around(poke)
+        reaction_around(self.model.shape(), poke, |point| self.point(point).reaction_n())
     }
 
     fn point(&self, point: PointId) -> PointState {
@@ -470,7 +360,10 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn energy(&self) -> Energy {
-        self.energies()
+        let TissueState { model, plan, tables, state, tiles, .. } = self;
+        let (_, mut energy, _) = self.survey(&tiles.region);
+        add_sleeping(&mut energy, model, plan, tables, state, tiles);
+        energy
     }
 
     fn largest_displacement_m(&self) -> f64 {
@@ -527,17 +420,28 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
-        TissueState::hash_blocks(self, blocks, hasher);
+        self.state.hash_blocks(&self.tables.layout, |point| self.tiles.has_moved(point), blocks, hasher);
+    }
+
+    fn set_profile(&mut self, now_ns: Option<fn() -> u64>) {
+        self.profile = now_ns.map(Profile::new);
+    }
+
+    fn profile(&self) -> Option<&Profile> {
+        self.profile.as_ref()
     }
 
     fn save(&self) -> SavedTissue {
-        TissueState::save(self)
+        self.saved()
     }
 
     fn copy(&self) -> ReadCopy {
-        TissueState::copy(self)
+        self.read_copy()
     }
 }
+
+#[cfg(test)]
+mod around_tests;
 
 #[cfg(test)]
 mod tests {

@@ -35,7 +35,6 @@ mod places;
 pub(crate) mod pressure;
 mod slots;
 mod sweep;
-pub(crate) mod volume_change;
 
 #[cfg(test)]
 mod tests;

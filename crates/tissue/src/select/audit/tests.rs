@@ -4,8 +4,9 @@
 use glam::DVec3;
 
 use super::*;
-use crate::Push;
 use crate::scene::profile::Poke;
+use crate::state::tissue_state::TissueState;
+use crate::{Push, Tissue};
 
 #[test]
 fn a_window_lasts_until_the_slowest_vibration_has_lost_half() {
@@ -62,29 +63,13 @@ fn next_mark(sheet: &mut TissueState<f64>) -> Mark {
 fn a_window_begins_at_a_checkpoint_and_ends_at_the_first_one_after_its_length() {
     // Four substeps: a checkpoint every 64 steps. The window of this tissue is 51 steps long.
     let mut sheet = moving(&["sheet.points=[5, 5]", "stepping.substeps=4"], 130);
-    assert_eq!(sheet.model.window_steps(), 51);
+    assert_eq!(Tissue::model(&sheet).window_steps(), 51);
     sheet.request_audit(WindowInputs::default());
     assert!(matches!(next_mark(&mut sheet), Mark::Begin(_)));
-    assert_eq!(sheet.steps, 192);
+    assert_eq!(sheet.step_count(), 192);
     assert!(matches!(next_mark(&mut sheet), Mark::End(..)));
-    assert_eq!(sheet.steps, 256);
+    assert_eq!(sheet.step_count(), 256);
     assert!(sheet.take_mark().is_none());
-}
-
-#[test]
-fn a_sheet_resumed_from_a_checkpoint_goes_on_as_the_first_does_also_with_a_halved_substep() {
-    for halvings in [0, 1, 2] {
-        let mut sheet = moving(&["sheet.points=[5, 5]", "stepping.substeps=2"], 30);
-        sheet.halve(0, halvings);
-        sheet.take_checkpoint();
-        let mut resumed = TissueState::resumed(&sheet.model, sheet.checkpoint.as_ref().unwrap());
-        assert_eq!(resumed.plan, sheet.plan);
-        for _ in 0..20 {
-            sheet.step().unwrap();
-            resumed.do_step();
-        }
-        assert_eq!(resumed.state_hash(), sheet.state_hash(), "{halvings} halvings");
-    }
 }
 
 #[test]
