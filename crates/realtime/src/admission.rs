@@ -263,6 +263,7 @@ impl Pacer {
             self.event_logs.get().filter(|_| recorded && playback.is_none()).map(|queue| EventLog::new(queue, about()));
         let handle = Arc::new(SessionHandle {
             id: id.clone(),
+            rules: intake.rules(),
             intake: Mutex::new(intake),
             owner: owner.clone(),
             idle_timeout_s,

@@ -22,11 +22,11 @@ use palpate_haptics::Law;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::batch::AcceptedBatch;
 use palpate_session::budget::{Account, Taken};
-use palpate_session::command::Command;
 use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::intake_transfer::Handed;
 use palpate_session::lease::LeaseId;
+use palpate_session::rules::{Commands, Rules};
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::sample_selection::{HEARTBEAT_S, Sampler, Sampling};
 use palpate_session::surface::Skin;
@@ -51,6 +51,8 @@ pub struct SessionHandle {
     pub skin: Option<Arc<Skin>>,
     /// Account of the caller that created the session, which is charged for it and its commands.
     pub owner: Account,
+    /// Rules of its intake, which checks commands without a lock.
+    pub(super) rules: Arc<Rules>,
     pub(super) intake: Mutex<Intake>,
     /// Time without calls, held tools or streams after which [`Pacer::delete_idle`](super::Pacer::delete_idle)
     /// deletes the session, s.
@@ -139,9 +141,8 @@ impl SessionHandle {
     /// Returns the refusals of [`Rules::check`](palpate_session::rules::Rules::check) (too many commands, an action
     /// that breaks a rule) and of [`Intake::accept`] (a session that is held, deleted or a playback; tools of other
     /// leases; an unfinished batch; sequence numbers that do not rise; tips; a full queue; missing memory).
-    pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<Accepted<'_>> {
-        let rules = lock(&self.intake).rules();
-        let checked = rules.check(commands)?;
+    pub fn submit(&self, lease: LeaseId, commands: impl Into<Commands>) -> Result<Accepted<'_>> {
+        let checked = self.rules.check(commands)?;
         self.at_intake(|intake, now| {
             let mut batch = intake.accept(lease, checked, now)?;
             let goes_on = intake.go_on(&mut batch);

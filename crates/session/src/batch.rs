@@ -1,7 +1,7 @@
 //! Batches of commands. A batch is accepted whole or not at all, and put in the queue in slices, so that no caller
 //! waits long for the intake.
 
-use std::collections::BTreeMap;
+use smallvec::SmallVec;
 
 use super::command::Command;
 use super::intake::Intake;
@@ -18,7 +18,36 @@ pub const SLICE: usize = 256;
 #[must_use]
 pub struct AcceptedBatch {
     id: LeaseId,
-    commands: std::vec::IntoIter<Command>,
+    commands: smallvec::IntoIter<[Command; 1]>,
+}
+
+/// What a batch brings to a tool, so far.
+#[derive(Clone, Copy)]
+struct Coming {
+    tool: u32,
+    /// The last sequence number.
+    sequence: u64,
+    /// Number of commands.
+    count: usize,
+    /// Radius of the tip after them, m.
+    tip_radius_m: Option<f64>,
+}
+
+/// What a batch brings to each of its tools, by ascending tool. A batch for one tool takes no memory of its own.
+#[derive(Default)]
+struct ToolsComing(SmallVec<[Coming; 1]>);
+
+impl ToolsComing {
+    fn of(&self, tool: u32) -> Option<Coming> {
+        self.0.binary_search_by_key(&tool, |coming| coming.tool).ok().map(|at| self.0[at])
+    }
+
+    fn set(&mut self, coming: Coming) {
+        match self.0.binary_search_by_key(&coming.tool, |coming| coming.tool) {
+            Ok(at) => self.0[at] = coming,
+            Err(at) => self.0.insert(at, coming),
+        }
+    }
 }
 
 impl Intake {
@@ -52,15 +81,14 @@ impl Intake {
             let message = "commands of this lease are being taken in: send them one call after another";
             return Err(Refusal::new(Reason::OutOfTurn, "", message));
         }
-        // For each tool: the last sequence number, the number of commands, and the tip after them.
-        let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
+        let mut last = ToolsComing::default();
         for command in &mut commands {
             let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
             let lease = lease.ok_or_else(|| {
                 Refusal::new(Reason::NotHolder, "tool", format!("{} is not held by this client", command.tool))
             })?;
-            let coming = last.get(&command.tool).copied();
-            let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
+            let coming = last.of(command.tool);
+            let before = coming.map(|coming| coming.sequence).or(lease.last_sequence);
             let sequence = command.sequence.unwrap_or_else(|| before.map_or(0, |before| before.saturating_add(1)));
             if let Some(before) = before.filter(|before| sequence <= *before && !command.by_datagram) {
                 let message = format!("must be above {before}, the last one, but is {sequence}");
@@ -68,20 +96,21 @@ impl Intake {
             }
             command.sequence = Some(sequence);
             let tip_radius_m = tip_radius_m(command);
-            let before_m = coming.map_or(lease.tip_radius_m, |coming| coming.2);
+            let before_m = coming.map_or(lease.tip_radius_m, |coming| coming.tip_radius_m);
             check_tip(before_m, tip_radius_m)?;
             if let (None, Some(now_m)) = (before_m, tip_radius_m) {
-                let of = |(tool, waiting_m)| last.get(&tool).map_or(waiting_m, |coming| coming.2);
+                let of = |(tool, waiting_m)| last.of(tool).map_or(waiting_m, |coming| coming.tip_radius_m);
                 let others = self.leases.tips_m().filter(|(tool, _)| *tool != command.tool).filter_map(of);
                 check_contact_work(&self.rules, self.substeps(), now_m, others)?;
             }
             let newest = before.map_or(sequence, |before| before.max(sequence));
-            last.insert(command.tool, (newest, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
+            let count = coming.map_or(0, |coming| coming.count) + 1;
+            last.set(Coming { tool: command.tool, sequence: newest, count, tip_radius_m });
         }
         // A limit per tool, so that no holder fills the queue for the others.
-        for (tool, (_, coming, _)) in &last {
+        for Coming { tool, count, .. } in &last.0 {
             let waiting = self.queue.waiting_of(*tool);
-            if waiting + coming > self.rules.limits.queued_commands_per_tool {
+            if waiting + count > self.rules.limits.queued_commands_per_tool {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");
                 return Err(Refusal::new(Reason::QueueFull, "", message));
             }

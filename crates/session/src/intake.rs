@@ -7,7 +7,7 @@ use super::Session;
 use super::command::{Command, Due};
 use super::lease::{LeaseId, Leases, QueueKey, not_held};
 use super::queue::{Discarded, Queue};
-use super::rules::{Rules, tip_radius_m};
+use super::rules::{Commands, Rules, tip_radius_m};
 use super::schedule::Schedule;
 use crate::budget::{Account, Purpose, Resource, Taken};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -253,7 +253,7 @@ impl Intake {
     /// Returns the refusals of [`Rules::check`] (too many commands, an action that breaks a rule) and of
     /// [`Intake::accept`] (closed intake, tools that this lease does not hold, an unfinished batch, sequence numbers
     /// that do not rise, another tip, tips with too much work, a full queue, missing memory).
-    pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
+    pub fn submit(&mut self, id: LeaseId, commands: impl Into<Commands>, now_ns: u64) -> Result<()> {
         self.check_open()?;
         let checked = self.rules.check(commands)?;
         let mut batch = self.accept(id, checked, now_ns)?;

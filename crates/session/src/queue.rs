@@ -5,8 +5,56 @@ use std::collections::BTreeMap;
 use super::command::Due;
 use super::lease::QueueKey;
 
-/// Commands by their key: step, then order of arrival.
-type Commands = BTreeMap<QueueKey, Due>;
+/// Commands by their key: step, then order of arrival. A single one takes no memory of its own: at 1 kHz a command waits
+/// alone for the next step.
+#[derive(Debug, Default)]
+struct Commands {
+    /// The only command; `None` if there are none or several.
+    single: Option<(QueueKey, Due)>,
+    /// Several commands; empty if there is one.
+    several: BTreeMap<QueueKey, Due>,
+}
+
+impl Commands {
+    fn len(&self) -> usize {
+        self.several.len() + usize::from(self.single.is_some())
+    }
+
+    fn iter(&self) -> impl Iterator<Item = (&QueueKey, &Due)> {
+        self.single.iter().map(|(key, due)| (key, due)).chain(&self.several)
+    }
+
+    fn insert(&mut self, key: QueueKey, due: Due) {
+        if self.single.is_none() && self.several.is_empty() {
+            self.single = Some((key, due));
+        } else {
+            self.several.extend(self.single.take());
+            self.several.insert(key, due);
+        }
+    }
+
+    /// Removes the command with a key, if `is_chosen` holds for it.
+    fn remove_if(&mut self, key: QueueKey, is_chosen: impl Fn(&Due) -> bool) -> Option<Due> {
+        if let Some((_, due)) = self.single.take_if(|(own, due)| *own == key && is_chosen(due)) {
+            return Some(due);
+        }
+        self.several.get(&key).is_some_and(is_chosen).then(|| self.several.remove(&key))?
+    }
+
+    /// Moves the commands that are due at step `step` or earlier to `due`, except those for which `is_held_back` holds.
+    fn take_due(&mut self, step: u64, is_held_back: &impl Fn(&QueueKey, &Due) -> bool, due: &mut Vec<(QueueKey, Due)>) {
+        due.extend(self.single.take_if(|(key, due)| key.0 <= step && !is_held_back(key, due)));
+        let mut from = (0, 0);
+        while let Some((key, entry)) = self.several.range(from..=(step, u64::MAX)).next() {
+            let key = *key;
+            if is_held_back(&key, entry) {
+                from = (key.0, key.1 + 1);
+            } else if let Some(entry) = self.several.remove(&key) {
+                due.push((key, entry));
+            }
+        }
+    }
+}
 
 /// Commands that no longer take effect, as [`Intake::close`](super::intake::Intake::close) returns them. Dropping
 /// this frees them, which takes time: do so without a lock.
@@ -49,7 +97,7 @@ impl Queue {
 
     /// Returns the number of commands of a tool that wait.
     pub(super) fn waiting_of(&self, tool: u32) -> usize {
-        self.by_tool.get(&tool).map_or(0, BTreeMap::len)
+        self.by_tool.get(&tool).map_or(0, Commands::len)
     }
 
     /// Adds an entry.
@@ -65,7 +113,7 @@ impl Queue {
     /// Removes the command of a tool with a key, if `is_chosen` holds for it. Returns it.
     pub(super) fn remove_if(&mut self, tool: u32, key: QueueKey, is_chosen: impl Fn(&Due) -> bool) -> Option<Due> {
         let commands = self.by_tool.get_mut(&tool)?;
-        let removed = commands.get(&key).is_some_and(is_chosen).then(|| commands.remove(&key)).flatten()?;
+        let removed = commands.remove_if(key, is_chosen)?;
         self.waiting -= 1;
         Some(removed)
     }
@@ -83,7 +131,7 @@ impl Queue {
     /// Discards everything, to be freed later. Returns the number of commands.
     pub(super) fn discard_all(&mut self) -> usize {
         let tools: Vec<u32> = self.by_tool.keys().copied().collect();
-        self.endings.clear();
+        self.endings = Commands::default();
         tools.into_iter().map(|tool| self.discard(tool)).sum()
     }
 
@@ -109,7 +157,7 @@ impl Queue {
     /// Returns the first step for which something waits.
     pub(super) fn first_step(&self) -> Option<u64> {
         let all = self.by_tool.values().chain([&self.endings]);
-        all.filter_map(|commands| commands.first_key_value()).map(|(key, _)| key.0).min()
+        all.filter_map(|commands| commands.iter().next()).map(|(key, _)| key.0).min()
     }
 
     /// Appends everything that is due at the beginning of step `step` to `due`, in order of effect, except entries
@@ -121,15 +169,7 @@ impl Queue {
         due: &mut Vec<Due>,
     ) -> usize {
         for commands in self.by_tool.values_mut().chain([&mut self.endings]) {
-            let mut from = (0, 0);
-            while let Some((key, entry)) = commands.range(from..=(step, u64::MAX)).next() {
-                let key = *key;
-                if is_held_back(&key, entry) {
-                    from = (key.0, key.1 + 1);
-                } else if let Some(entry) = commands.remove(&key) {
-                    self.due.push((key, entry));
-                }
-            }
+            commands.take_due(step, &is_held_back, &mut self.due);
         }
         let count = self.due.iter().filter(|(_, entry)| !entry.ends_lease).count();
         self.waiting -= count;
@@ -141,7 +181,7 @@ impl Queue {
     /// Returns everything that waits, in order of effect.
     pub(super) fn in_order(&self) -> Vec<(QueueKey, &Due)> {
         let all = self.by_tool.values().chain([&self.endings]);
-        let mut all: Vec<_> = all.flatten().map(|(key, due)| (*key, due)).collect();
+        let mut all: Vec<_> = all.flat_map(Commands::iter).map(|(key, due)| (*key, due)).collect();
         all.sort_unstable_by_key(|(key, _)| *key);
         all
     }

@@ -1,5 +1,7 @@
 //! The rules for a command that do not depend on when it comes, so it can be checked without locking the intake.
 
+use smallvec::SmallVec;
+
 use super::command::Command;
 use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
@@ -16,10 +18,13 @@ pub struct Rules {
     pub(super) limits: Limits,
 }
 
+/// Commands of one call. A single one, as in a stream at 1 kHz, takes no memory of its own.
+pub type Commands = SmallVec<[Command; 1]>;
+
 /// Commands that [`Rules::check`] has accepted, in their order, for
 /// [`Intake::accept`](super::intake::Intake::accept).
 #[derive(Debug)]
-pub struct CheckedCommands(pub(super) Vec<Command>);
+pub struct CheckedCommands(pub(super) Commands);
 
 impl Rules {
     /// Creates the rules of a session that begins with `scene`, under `limits`.
@@ -38,7 +43,8 @@ impl Rules {
     /// # Errors
     /// Refuses more commands than one tool may have waiting, `limits.queued_commands_per_tool`
     /// ([`Reason::QueueFull`]), and the first command that [`Rules::check_one`] refuses.
-    pub fn check(&self, commands: Vec<Command>) -> Result<CheckedCommands> {
+    pub fn check(&self, commands: impl Into<Commands>) -> Result<CheckedCommands> {
+        let commands = commands.into();
         if commands.len() > self.limits.queued_commands_per_tool {
             let message = format!("{} commands are more than a tool may have waiting", commands.len());
             return Err(Refusal::new(Reason::QueueFull, "", message));

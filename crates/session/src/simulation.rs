@@ -93,7 +93,7 @@ impl Simulation {
             self.intake.acquire(&[tool], "simulation", lease_s, LEASE, 0)?;
         }
         let command = Command { at_step: Some(self.session.step_count()), ..Command::new(tool, None, action) };
-        self.intake.submit(LEASE, vec![command], 0)
+        self.intake.submit(LEASE, [command], 0)
     }
 
     /// Applies an input from a journal. Commands act at the coming step without being checked, and another tissue

@@ -125,7 +125,7 @@ impl LeaseController {
             .take(now, "commands of this stream")
             .and_then(|()| wire::command::from_command(message, handle.model.shape(), now))
             .and_then(|command| within_reach(command, handle, self.device.as_ref()))
-            .and_then(|command| handle.submit(self.lease, vec![Command { by_datagram, ..command }]).map(drop));
+            .and_then(|command| handle.submit(self.lease, [Command { by_datagram, ..command }]).map(drop));
         self.traffic.commanded(usize::from(taken.is_ok()));
         let Err(refusal) = taken else { return Ok(()) };
         handle.count_refused(1);

@@ -27,7 +27,7 @@ use palpate_realtime::StreamKind;
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::ids::random_bits;
 use palpate_refusal::{Reason, Refusal};
-use palpate_session::command::Command;
+use palpate_session::rules::Commands;
 use palpate_session::wire;
 use palpate_tissue::shape::{PointId, PointName, RestShape};
 
@@ -121,7 +121,7 @@ impl HapticService for Haptics {
             let command = wire::command::from_command(command, shape, now);
             command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))
         };
-        let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
+        let commands: Result<Commands, Refusal> = request.commands.iter().enumerate().map(read).collect();
         let accepted = commands.and_then(|commands| handle.submit(lease, commands)).inspect_err(|refusal| {
             handle.count_refused(request.commands.len());
             self.0.traffic.refused(refusal.reason);

@@ -231,7 +231,7 @@ fn a_batch_is_taken_in_slices_and_acts_whole() {
     let (mut intake, _) = intake();
     intake.acquire(&[1], "other", 1.0, LEASE + 1, 0).unwrap();
     intake.submit(LEASE, vec![release(1, Some(3))], 0).unwrap();
-    let commands = (2..902).map(|sequence| release(sequence, Some(3 + sequence % 2))).collect();
+    let commands: Vec<_> = (2..902).map(|sequence| release(sequence, Some(3 + sequence % 2))).collect();
     let checked = intake.rules().check(commands).unwrap();
     let mut batch = intake.accept(LEASE, checked, 0).unwrap();
     let mut slices = 1;
@@ -261,7 +261,7 @@ fn a_batch_is_taken_in_slices_and_acts_whole() {
 #[test]
 fn a_batch_whose_tool_is_released_meanwhile_is_dropped_whole() {
     let (mut intake, _) = intake();
-    let commands = (0..600).map(|sequence| release(sequence, Some(9))).collect();
+    let commands: Vec<_> = (0..600).map(|sequence| release(sequence, Some(9))).collect();
     let checked = intake.rules().check(commands).unwrap();
     let mut batch = intake.accept(LEASE, checked, 0).unwrap();
     assert!(intake.go_on(&mut batch));
@@ -295,7 +295,7 @@ fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_o
         assert_eq!((due(&mut intake, step).len(), is_charged(left)), (1000, true), "{} bytes for {left}", charged());
     }
     // A batch is discarded as a whole at the end of its lease.
-    intake.submit(LEASE, (3000..6000).map(|sequence| release(sequence, Some(100))).collect(), 0).unwrap();
+    intake.submit(LEASE, (3000..6000).map(|sequence| release(sequence, Some(100))).collect::<Vec<_>>(), 0).unwrap();
     assert!(is_charged(3000), "{}", charged());
     intake.release(LEASE).unwrap();
     due(&mut intake, 13);
@@ -312,7 +312,7 @@ fn of_poses_for_one_step_the_last_counts_and_of_those_played_by_the_clients_time
             client_time_ns: client_time_ns * sequence,
             ..release(sequence, at_step)
         };
-        intake.submit(LEASE, (1..=3).map(pose).collect(), 0).unwrap();
+        intake.submit(LEASE, (1..=3).map(pose).collect::<Vec<_>>(), 0).unwrap();
         (intake.counts().superseded, intake.counts().waiting)
     };
     assert_eq!(superseded(None, 0), (2, 1));
@@ -326,7 +326,7 @@ fn as_many_commands_come_at_once_as_a_tool_may_have_waiting_and_no_more() {
     let limits = Limits { queued_commands_per_tool: 3, ..Limits::default() };
     let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
     let rules = Rules { scene, limits };
-    let of = |count: u64| rules.check((0..count).map(|sequence| release(sequence, None)).collect());
+    let of = |count: u64| rules.check((0..count).map(|sequence| release(sequence, None)).collect::<Vec<_>>());
     assert!((0..=3).all(|count| of(count).is_ok()));
     for count in [4, 5, 100] {
         assert_eq!(of(count).unwrap_err().reason, Reason::QueueFull, "{count} commands");
@@ -421,5 +421,5 @@ fn tips_that_a_step_has_no_time_for_are_refused_with_the_radius_that_fits() {
     // The discs of a sheet have bounded cost, and an offline run delays no other session.
     let mut alone = Intake::new(&model.scene, &limits);
     alone.acquire(&tools, "test", 1.0, LEASE, 0).unwrap();
-    alone.submit(LEASE, tools.iter().map(|tool| pose(*tool, 1, radius_m)).collect(), 0).unwrap();
+    alone.submit(LEASE, tools.iter().map(|tool| pose(*tool, 1, radius_m)).collect::<Vec<_>>(), 0).unwrap();
 }
