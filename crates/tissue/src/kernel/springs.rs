@@ -176,6 +176,7 @@ impl<T: Real> Springs<T> {
     }
 
     /// Returns the force of all springs on the point [i, j]. For a few single points.
+    #[inline(always)]
     pub(crate) fn gather(&self, layout: &Layout, u: &[T], [i, j]: [usize; 2]) -> [T; 3] {
         let mut sum = [T::default(); 3];
         let at = |i: usize, j: usize, c: usize| u[c * layout.plane + i * layout.stride + j];

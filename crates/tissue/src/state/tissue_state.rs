@@ -187,7 +187,7 @@ impl<T: Real> TissueState<T> {
         let TissueState { model, plan, tables, state, .. } = self;
         let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
         let unit = plan.scheme.spring_scale() * scale;
-        let springs = tables.springs.gather(&tables.layout, &state.u, self.volume_change(), model.point_of(index));
+        let springs = tables.gather(&state.u, self.volume_change(), model.point_of(index));
         let [i, j] = model.point_of(index);
         let mass = model.relative_mass_at(index);
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);

@@ -576,6 +576,7 @@ impl<V: Vector> Strain<V> {
 
 /// Returns the force of the springs and of the extra anchor stiffness on one slot, minus the pressure
 /// `pressed`. For a few single points. `unit` and `pull` as in [`MeshGrid`].
+#[inline(always)]
 pub(crate) fn gather<T: Real>(
     slots: &MeshSlots,
     unit: &SpringCoefficients<T>,

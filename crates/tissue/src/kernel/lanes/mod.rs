@@ -329,6 +329,16 @@ pub(crate) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
     }
 }
 
+/// Runs `program` with fused multiply-add as an instruction, for work on single numbers: without it each operation
+/// would call the C library. The width of `program` is that of plain lanes, and should not matter to it.
+///
+/// # Safety
+/// The pointers of `program` are valid as documented.
+pub(crate) unsafe fn run_single<T: Real>(program: &impl Run<T>) {
+    // SAFETY: `Width::of` leaves no machine without the instruction; the rest is the caller's promise.
+    unsafe { run(Width(Lanes::Plain), program) }
+}
+
 /// The operations that registers of every kind have under the same name.
 // SAFETY (of every block): the processor has the instructions. The functions that create the first value require it,
 // and every other function takes a value. Memory is the caller's promise.
