@@ -105,16 +105,9 @@ impl Plan {
         model.unit_m / (self.scheme.impulse() * self.force_scale(&model.scene))
     }
 
-    /// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables and the
-    /// displacement in spacings.
-    pub(super) fn spring_force_n(&self, model: &Model, index: usize, gathered: f64, u: f64) -> f64 {
-        let force_n = gathered / (self.scheme.spring_scale() * self.force_scale(&model.scene));
-        if !model.places.differ() {
-            return force_n;
-        }
-        // Anchor stiffness beyond the reference K″ is not part of the springs.
-        let pulled_n = model.scene.anchor_stiffness_n_per_m * model.extra_anchor_at(index) * u * model.unit_m;
-        model.relative_mass_at(index) * (force_n + pulled_n)
+    /// Returns the factor from newtons on a point of the reference mass to the unit of force of the springs' tables, 1/N.
+    pub(super) fn spring_unit(&self, scene: &Scene) -> f64 {
+        self.scheme.spring_scale() * self.force_scale(scene)
     }
 
     /// Returns the factor from newtons on a point of the reference mass to the scheme's unit of force:
@@ -275,6 +268,18 @@ impl Model {
     /// Returns K″ at a place in memory divided by the reference value.
     pub(super) fn relative_anchor_stiffness_at(&self, index: usize) -> f64 {
         self.relative_mass_at(index) * (1.0 + self.extra_anchor_at(index))
+    }
+
+    /// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables in their unit
+    /// ([`Plan::spring_unit`]) and the displacement in spacings.
+    pub(super) fn spring_force_n(&self, spring_unit: f64, index: usize, gathered: f64, u: f64) -> f64 {
+        let force_n = gathered / spring_unit;
+        if !self.places.differ() {
+            return force_n;
+        }
+        // Anchor stiffness beyond the reference K″ is not part of the springs.
+        let pulled_n = self.scene.anchor_stiffness_n_per_m * self.extra_anchor_at(index) * u * self.unit_m;
+        self.relative_mass_at(index) * (force_n + pulled_n)
     }
 
     /// Returns the number of places that a substep computes with all points awake: rows times columns in

@@ -176,25 +176,34 @@ impl<T: Real> Springs<T> {
     }
 
     /// Returns the force of all springs on the point [i, j]. For a few single points.
+    // Loops over indices: iterators are not always inlined, and then run without the caller's instructions.
+    #[allow(clippy::needless_range_loop)]
     #[inline(always)]
     pub(crate) fn gather(&self, layout: &Layout, u: &[T], [i, j]: [usize; 2]) -> [T; 3] {
         let mut sum = [T::default(); 3];
-        let at = |i: usize, j: usize, c: usize| u[c * layout.plane + i * layout.stride + j];
-        for (kind, reach) in
-            [(Some(&self.structural), STRUCTURAL), (Some(&self.shear), SHEAR), (self.bending.as_ref(), BENDING)]
-        {
-            let Some(kind) = kind else { continue };
-            for [di, dj] in reach {
-                let Some((i1, j1)) = i.checked_add_signed(di).zip(j.checked_add_signed(dj)) else { continue };
+        let own = i * layout.stride + j;
+        let kinds = [Some(&self.structural), Some(&self.shear), self.bending.as_ref()];
+        for kind in 0..3 {
+            let Some(spring) = kinds[kind] else { continue };
+            for end in 0..4 {
+                let [di, dj] = ENDS[kind][end];
+                // Below 0 it wraps, to beyond the last.
+                let (i1, j1) = (i.wrapping_add_signed(di), j.wrapping_add_signed(dj));
                 if i1 >= layout.rows || j1 >= layout.columns {
                     continue;
                 }
                 #[allow(clippy::cast_precision_loss)]
                 let rest = [T::of(di as f64), T::of(dj as f64), T::default()];
-                let delta: [T; 3] = std::array::from_fn(|c| at(i1, j1, c) - at(i, j, c));
+                let (other, mut delta) = (i1 * layout.stride + j1, [T::default(); 3]);
+                for c in 0..3 {
+                    delta[c] = u[c * layout.plane + other] - u[c * layout.plane + own];
+                }
                 let along = rest[0] * delta[0] + rest[1] * delta[1];
-                let squares = delta.iter().fold(along + along, |sum, d| d.fused(*d, sum));
-                let weight = kind.weight(Scalar(squares)).0;
+                let mut squares = along + along;
+                for c in 0..3 {
+                    squares = delta[c].fused(delta[c], squares);
+                }
+                let weight = spring.weight(Scalar(squares)).0;
                 for c in 0..3 {
                     sum[c] += weight.fused(delta[c], weight * rest[c]);
                 }
@@ -204,9 +213,9 @@ impl<T: Real> Springs<T> {
     }
 }
 
-const STRUCTURAL: [[isize; 2]; 4] = [[-1, 0], [0, -1], [0, 1], [1, 0]];
-const SHEAR: [[isize; 2]; 4] = [[-1, -1], [-1, 1], [1, -1], [1, 1]];
-const BENDING: [[isize; 2]; 4] = [[-2, 0], [0, -2], [0, 2], [2, 0]];
+/// Rows and columns to the other ends of structural, shear and bending springs.
+const ENDS: [[[isize; 2]; 4]; 3] =
+    [[[-1, 0], [0, -1], [0, 1], [1, 0]], [[-1, -1], [-1, 1], [1, -1], [1, 1]], [[-2, 0], [0, -2], [0, 2], [2, 0]]];
 
 #[cfg(test)]
 mod tests {

@@ -4,6 +4,7 @@ pub(crate) mod context;
 mod copy;
 mod guarded;
 pub(crate) mod profile;
+mod reading;
 pub(crate) mod restore;
 pub mod saved;
 mod step;

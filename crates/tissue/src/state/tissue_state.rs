@@ -14,21 +14,20 @@ use crate::guard::survey::{Forces, Survey, energy_of, pressure_j};
 use crate::guard::work::Work;
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
 use crate::kernel::field::{BLOCK, Layout, State};
-use crate::kernel::lanes::Scalar;
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::memory;
 use crate::model::{Model, Plan};
 use crate::response::around_place::reaction_around;
 use crate::scene::Precision;
-use crate::scene::profile::{Moment, Poke};
-use crate::scheme::arithmetic::MAX_KEPT;
+use crate::scene::profile::Poke;
 use crate::scheme::observer::Observer;
 use crate::select::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::shape::PointId;
 use crate::sleep::criterion::add_sleeping;
 use crate::sleep::tiles::SleepTiles;
 use crate::state::profile::{Profile, StepStage};
+use crate::state::reading::PointReader;
 use crate::state::saved::SavedTissue;
 use crate::tools::applied_force::{Applied, Push, Term};
 use crate::tools::contact::{Contacts, TangentInput, Tool, ToolContact, displacement_m};
@@ -139,16 +138,23 @@ impl<T: Real> TissueState<T> {
         tool.footprint.surface(|point| displacement_m(&self.model, &self.tables.layout, &self.state, point)).0
     }
 
-    /// Returns the force on a free point but for tips and inertia, N: that of springs, anchor springs, damping and
-    /// force-controlled tools.
-    fn force_on_free(&self, index: usize, mass: f64) -> DVec3 {
-        let scene = &self.model.scene;
-        let of_stiffness = self.model.relative_anchor_stiffness_at(index);
-        let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(&self.model, index) };
-        let [u, v, spring_n] = self.free_point(index, applied_n);
-        let anchor_n = -of_stiffness * scene.anchor_stiffness_n_per_m * u;
-        let damping_n = -mass * scene.damping_n_s_per_m * v;
-        spring_n + anchor_n + damping_n + applied_n
+    /// Returns a reader of points.
+    fn reader(&self) -> PointReader<'_, T> {
+        let TissueState { model, plan, tables, state, applied, prescribed, contacts, tiles, .. } = self;
+        PointReader {
+            model,
+            plan,
+            tables,
+            state,
+            applied,
+            prescribed,
+            contacts,
+            tiles,
+            steps: self.steps,
+            volume_change: self.volume_change(),
+            observer: Observer::of(&plan.scheme),
+            spring_unit: plan.spring_unit(&model.scene),
+        }
     }
 
     /// Returns the tools' force at the end of the last step, in the springs' units, if the scheme needs it to
@@ -158,7 +164,7 @@ impl<T: Real> TissueState<T> {
         if !plan.scheme.takes_means() || self.steps == 0 {
             return Vec::new();
         }
-        self.applied.until_now(model, &tables.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
+        self.applied.until_now(model, &tables.layout, plan.spring_unit(&model.scene))
     }
 
     /// Surveys part of the tissue. Returns the survey, the energies, and the energy that the scheme conserves;
@@ -172,44 +178,14 @@ impl<T: Real> TissueState<T> {
         let (mut energy, kept_j) = energy_of(model, plan, &survey);
         energy.spring_j += pressure_j;
         // A grasped point moves with its tool, not as the scheme would move it.
+        let reader = self.reader();
         let own = self.prescribed.grasped().map(|(index, motion)| {
-            let [_, free, _] = self.free_point(index, self.applied.until(model, index));
+            let free = reader.free_velocity_m_per_s(index);
             model.relative_mass_at(index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
         });
         let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
         energy.kinetic_j += grasped_j;
         (survey, energy, kept_j + grasped_j + pressure_j)
-    }
-
-    /// Returns displacement, velocity and springs' force of a free point, under the applied force `applied_n`
-    /// and that of tips.
-    fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
-        let TissueState { model, plan, tables, state, .. } = self;
-        let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
-        let unit = plan.scheme.spring_scale() * scale;
-        let springs = tables.gather(&state.u, self.volume_change(), model.point_of(index));
-        let [i, j] = model.point_of(index);
-        let mass = model.relative_mass_at(index);
-        let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
-        // Without all present forces, a two-step scheme would report a velocity for a point that rests under a
-        // tip.
-        let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on(model, index) } else { DVec3::ZERO };
-        let pushed_n = applied_n + tips_n;
-        let observer = Observer::<f64>::of(&plan.scheme);
-        let mut found = [DVec3::ZERO; 3];
-        for (c, n) in springs.into_iter().enumerate() {
-            let at = c * tables.layout.plane + tables.layout.offset(index);
-            let one = Scalar::<f64>;
-            let mut kept = [one(0.0); MAX_KEPT];
-            kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
-            let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
-            let force = one(unit * pushed_n[c] / mass);
-            let [u, w, _] = observer.observe(u, d, n, &kept, Some(force));
-            found[0][c] = u.0 * spacing_m;
-            found[1][c] = if still { 0.0 } else { w.0 * spacing_m / plan.substep_s };
-            found[2][c] = plan.spring_force_n(model, index, n.0, state.u[at].wide());
-        }
-        found
     }
 }
 
@@ -252,8 +228,8 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn tool_contact(&self, tool: usize) -> Option<ToolContact> {
         self.keep_growth();
-        let tool = self.contacts.tool(tool)?;
-        let without_inertia = || tool.without_inertia(&self.model, |index, mass| self.force_on_free(index, mass));
+        let (tool, reader) = (self.contacts.tool(tool)?, self.reader());
+        let without_inertia = || tool.without_inertia(&self.model, |index, mass| reader.force_on_free_n(index, mass));
         Some(tool.contact(self.surface_m(tool), without_inertia))
     }
 
@@ -320,31 +296,14 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn reaction_around_n(&self, poke: &Poke) -> DVec3 {
         self.keep_growth();
-        reaction_around(self.model.shape(), poke, |point| self.point(point).reaction_n())
+        let reader = self.reader();
+        let reaction_n = |point| reader.point(self.model.place_of(point)).reaction_n();
+        reaction_around(self.model.shape(), poke, reaction_n)
     }
 
     fn point(&self, point: PointId) -> PointState {
         self.keep_growth();
-        let index = self.model.place_of(point);
-        let scene = &self.model.scene;
-        let applied_n = match self.steps {
-            0 => self.applied.from(&self.model, index, Moment::start_of(0)),
-            _ => self.applied.until(&self.model, index),
-        };
-        let [mut displacement_m, mut velocity_m_per_s, spring_n] = self.free_point(index, applied_n);
-        let motion = self.prescribed.motion(&self.model, index);
-        if let Some(motion) = motion {
-            (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
-        }
-        let mass = self.model.relative_mass_at(index);
-        let anchor_n =
-            -scene.anchor_stiffness_n_per_m * self.model.relative_anchor_stiffness_at(index) * displacement_m;
-        let damping_n = -scene.damping_n_s_per_m * mass * velocity_m_per_s;
-        let constraint_n = motion.map(|motion| {
-            let inertia_n = scene.point_mass_kg() * mass * motion.acceleration_m_per_s2;
-            inertia_n - spring_n - anchor_n - damping_n - applied_n
-        });
-        PointState { displacement_m, velocity_m_per_s, spring_n, anchor_n, damping_n, applied_n, constraint_n }
+        self.reader().point(self.model.place_of(point))
     }
 
     fn awake_points(&self) -> usize {

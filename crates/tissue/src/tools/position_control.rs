@@ -180,12 +180,13 @@ fn states<T: Real>(
     volume_change: f64,
     tool: &Tool,
 ) -> Vec<UnderTip> {
+    let spring_unit = plan.spring_unit(&model.scene);
     let of = |WeightedNode { point, mass, .. }: WeightedNode| {
         let index = model.index_of(point);
         let at = |c: usize| c * tables.layout.plane + tables.layout.offset(index);
         let vector = |field: &Field<T>| DVec3::from_array([0, 1, 2].map(|c| field[at(c)].wide()));
         let (u, springs) = (vector(&state.u), tables.gather(&state.u, volume_change, point));
-        let spring_n = [0, 1, 2].map(|c| plan.spring_force_n(model, index, springs[c].wide(), u[c]));
+        let spring_n = [0, 1, 2].map(|c| model.spring_force_n(spring_unit, index, springs[c].wide(), u[c]));
         let place_n_per_m = model.scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index);
         let u_m = model.unit_m * u;
         UnderTip { mass, u_m, d: vector(&state.d), pull_n: DVec3::from_array(spring_n) - place_n_per_m * u_m }

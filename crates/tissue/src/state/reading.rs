@@ -1,0 +1,110 @@
+//! Reads the motion of points and the forces on them from a state.
+
+use glam::DVec3;
+
+use crate::body::tables::SweepTables;
+use crate::interface::PointState;
+use crate::kernel::field::State;
+use crate::kernel::lanes::Scalar;
+use crate::kernel::real::Real;
+use crate::model::{Model, Plan};
+use crate::scene::profile::Moment;
+use crate::scheme::arithmetic::MAX_KEPT;
+use crate::scheme::observer::Observer;
+use crate::sleep::tiles::SleepTiles;
+use crate::tools::applied_force::Applied;
+use crate::tools::contact::Contacts;
+use crate::tools::prescribed::Prescribed;
+
+/// A reader of points: what is the same for all points is computed once.
+pub(super) struct PointReader<'a, T: Real> {
+    pub(super) model: &'a Model,
+    pub(super) plan: &'a Plan,
+    pub(super) tables: &'a SweepTables<T>,
+    pub(super) state: &'a State<T>,
+    pub(super) applied: &'a Applied<T>,
+    pub(super) prescribed: &'a Prescribed,
+    pub(super) contacts: &'a Contacts,
+    pub(super) tiles: &'a SleepTiles<T>,
+    pub(super) steps: u64,
+    /// Growth of the volume, in cubes of the unit of length.
+    pub(super) volume_change: f64,
+    pub(super) observer: Observer<f64>,
+    /// [`Plan::spring_unit`].
+    pub(super) spring_unit: f64,
+}
+
+impl<T: Real> PointReader<'_, T> {
+    /// Returns the force of force-controlled tools on a place in memory, N.
+    fn applied_n(&self, index: usize) -> DVec3 {
+        match self.steps {
+            0 => self.applied.from(self.model, index, Moment::start_of(0)),
+            _ => self.applied.until(self.model, index),
+        }
+    }
+
+    /// Returns the motion of the point at a place in memory, and the forces on it.
+    pub(super) fn point(&self, index: usize) -> PointState {
+        let (model, scene) = (self.model, &self.model.scene);
+        let applied_n = self.applied_n(index);
+        let [mut displacement_m, mut velocity_m_per_s, spring_n] = self.free_point(index, applied_n);
+        let motion = self.prescribed.motion(model, index);
+        if let Some(motion) = motion {
+            (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
+        }
+        let mass = model.relative_mass_at(index);
+        let anchor_n = -scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index) * displacement_m;
+        let damping_n = -scene.damping_n_s_per_m * mass * velocity_m_per_s;
+        let constraint_n = motion.map(|motion| {
+            let inertia_n = scene.point_mass_kg() * mass * motion.acceleration_m_per_s2;
+            inertia_n - spring_n - anchor_n - damping_n - applied_n
+        });
+        PointState { displacement_m, velocity_m_per_s, spring_n, anchor_n, damping_n, applied_n, constraint_n }
+    }
+
+    /// Returns the force on a free point but for tips and inertia, N: that of springs, anchor springs, damping and
+    /// force-controlled tools.
+    pub(super) fn force_on_free_n(&self, index: usize, mass: f64) -> DVec3 {
+        let scene = &self.model.scene;
+        let of_stiffness = self.model.relative_anchor_stiffness_at(index);
+        let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(self.model, index) };
+        let [u, v, spring_n] = self.free_point(index, applied_n);
+        let anchor_n = -of_stiffness * scene.anchor_stiffness_n_per_m * u;
+        let damping_n = -mass * scene.damping_n_s_per_m * v;
+        spring_n + anchor_n + damping_n + applied_n
+    }
+
+    /// Returns the velocity that a grasped point would have if it were free, m/s.
+    pub(super) fn free_velocity_m_per_s(&self, index: usize) -> DVec3 {
+        let [_, velocity_m_per_s, _] = self.free_point(index, self.applied.until(self.model, index));
+        velocity_m_per_s
+    }
+
+    /// Returns displacement, velocity and springs' force of a free point, under the applied force `applied_n`
+    /// and that of tips.
+    fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
+        let PointReader { model, plan, tables, state, .. } = self;
+        let springs = tables.gather(&state.u, self.volume_change, model.point_of(index));
+        let [i, j] = model.point_of(index);
+        let mass = model.relative_mass_at(index);
+        let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
+        // Without all present forces, a two-step scheme would report a velocity for a point that rests under a
+        // tip.
+        let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on(model, index) } else { DVec3::ZERO };
+        let pushed_n = applied_n + tips_n;
+        let mut found = [DVec3::ZERO; 3];
+        for (c, n) in springs.into_iter().enumerate() {
+            let at = c * tables.layout.plane + tables.layout.offset(index);
+            let one = Scalar::<f64>;
+            let mut kept = [one(0.0); MAX_KEPT];
+            kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
+            let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
+            let force = one(self.spring_unit * pushed_n[c] / mass);
+            let [u, w, _] = self.observer.observe(u, d, n, &kept, Some(force));
+            found[0][c] = u.0 * model.unit_m;
+            found[1][c] = if still { 0.0 } else { w.0 * model.unit_m / plan.substep_s };
+            found[2][c] = model.spring_force_n(self.spring_unit, index, n.0, state.u[at].wide());
+        }
+        found
+    }
+}
