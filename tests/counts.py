@@ -32,7 +32,7 @@ ASKS = re.compile(
 )
 AT_HOME = ("crates/tissue/src/body/", "crates/tissue/src/scene/mod.rs", "crates/tissue/src/scene/sheet",
            "crates/tissue/src/scene/mesh", "crates/session/src/wire/scene.rs")
-OF_TESTS = re.compile(r"(^|/)(tests|benches|examples|fuzz)/|(^|/)tests\.rs$")
+OF_TESTS = re.compile(r"(^|/)(tests|benches|examples|fuzz)/|(^|/|_)tests\.rs$")
 
 
 def files(*endings):

@@ -6,7 +6,7 @@ mod common;
 use std::sync::Arc;
 
 use common::{playing, scene_with, script};
-use palpate_session::run::run;
+use palpate_session::run::{RunOptions, run};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{PAPER, Scene};
 use palpate_tissue::{self as tissue, Grasp, Model};
@@ -41,7 +41,17 @@ fn hash(scene: &Scene, held: bool) -> String {
     let script = script(ALL_LAWS, scene);
     let model = common::model(scene);
     let mut output = Vec::new();
-    run(&model, &script, [held, false], &Limits::default(), &mut output, &|| 0.0, &mut |_| {}).unwrap().final_hash
+    run(
+        &model,
+        &script,
+        RunOptions { held, ..Default::default() },
+        &Limits::default(),
+        &mut output,
+        &|| 0.0,
+        &mut |_| {},
+    )
+    .unwrap()
+    .final_hash
 }
 
 #[test]

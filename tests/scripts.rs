@@ -11,7 +11,7 @@ use common::{model, scene_with, script};
 use glam::DVec3;
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};
-use palpate_session::run::run;
+use palpate_session::run::{RunOptions, run};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
@@ -30,7 +30,8 @@ fn shipped(name: &str, scene: &Scene) -> Script {
 
 fn run_whole(model: &Arc<Model>, script: &Script, held: bool) -> (Vec<serde_json::Value>, Summary) {
     let (mut out, limits) = (Vec::new(), Limits::default());
-    let summary = run(model, script, [held, false], &limits, &mut out, &|| 0.0, &mut |_| {}).unwrap();
+    let summary =
+        run(model, script, RunOptions { held, ..Default::default() }, &limits, &mut out, &|| 0.0, &mut |_| {}).unwrap();
     let lines = String::from_utf8(out).unwrap();
     (lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect(), summary)
 }

@@ -11,7 +11,7 @@ use common::{model, scene_with, schemes};
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};
 use palpate_refusal::Reason;
-use palpate_session::run::run;
+use palpate_session::run::{RunOptions, run};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::tangent;
 use palpate_tissue::scene::profile::Poke;
@@ -280,7 +280,16 @@ fn an_audit_in_f64_finds_the_error_within_the_tolerance_also_of_what_sleeps() {
                     falloff_per_m = 60.0\nfalloff_offset = 0.0\nprofile = { type = \"pulse\", on_s = 0.05, off_s = 0.3 }\n";
         let (script, limits) = (common::script(text, &scene), Limits::default());
         let mut output = Vec::new();
-        let summary = run(&model(&scene), &script, [false, true], &limits, &mut output, &|| 0.0, &mut |_| {}).unwrap();
+        let summary = run(
+            &model(&scene),
+            &script,
+            RunOptions { audit: true, ..Default::default() },
+            &limits,
+            &mut output,
+            &|| 0.0,
+            &mut |_| {},
+        )
+        .unwrap();
         let found = summary.audited_error.unwrap();
         println!("{found:?}, {:e} asked for", scene.stepping.tolerance);
         assert!(found.largest() <= scene.stepping.tolerance, "{}: {found:?}", scene.name);

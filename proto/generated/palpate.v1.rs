@@ -3070,6 +3070,10 @@ pub struct Session {
     /// On a server of a fleet: the server that has the session, and since which revision of etcd.
     #[prost(message, optional, tag = "33")]
     pub ownership: ::core::option::Option<Ownership>,
+    /// The time of each stage of a step, summed since the session came to this server, in the order of a step. Empty unless the
+    /// server measures it (`palpate serve --profile`).
+    #[prost(message, repeated, tag = "34")]
+    pub stages: ::prost::alloc::vec::Vec<StageTime>,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";
@@ -3079,6 +3083,26 @@ impl ::prost::Name for Session {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Session".into()
+    }
+}
+/// The time that a stage of a session's steps has taken.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StageTime {
+    /// sleep (which parts of the tissue wake and sleep), pressure (of an enclosed volume), force (force-controlled tools), sweep
+    /// (the springs), grasp, contact (position-controlled tools), or guard (checks of the motion).
+    #[prost(string, tag = "1")]
+    pub stage: ::prost::alloc::string::String,
+    #[prost(double, tag = "2")]
+    pub time_s: f64,
+}
+impl ::prost::Name for StageTime {
+    const NAME: &'static str = "StageTime";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.StageTime".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.StageTime".into()
     }
 }
 /// The server that has a session of a fleet. A call to another server of the fleet is refused as ELSEWHERE, with

@@ -3,10 +3,11 @@
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 
-use palpate_session::run::run;
+use palpate_realtime::clock::now_ns;
+use palpate_session::run::{RunOptions, run};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
-use palpate_tissue::scene::record::{self, Summary};
+use palpate_tissue::scene::record::{self, StageTime, Summary};
 
 use super::scene::{SceneArguments, compile};
 use super::{Failure, clock_s, say, with_progress};
@@ -33,6 +34,9 @@ pub(crate) struct RunArguments {
     /// along z, on a mesh their magnitudes; without --output the records are then not written to a terminal
     #[arg(long)]
     plot: bool,
+    /// Measure how long each stage of a step takes: the summary then has `stages`
+    #[arg(long)]
+    profile: bool,
     /// Show no progress and no summary
     #[arg(short, long)]
     quiet: bool,
@@ -47,7 +51,9 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     }
     let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
     let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
-        run(&model, &script, [arguments.held, arguments.audit], &limits, &mut output, &clock_s, progress)
+        let profile = arguments.profile.then_some(now_ns as fn() -> u64);
+        let options = RunOptions { held: arguments.held, audit: arguments.audit, profile };
+        run(&model, &script, options, &limits, &mut output, &clock_s, progress)
     });
     let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(SimulationFailure::Output));
     match ended {
@@ -77,6 +83,11 @@ fn tell(arguments: &RunArguments, summary: &Summary) {
             ("final hash", summary.final_hash.clone()),
         ];
         text.extend(rows.map(|(name, value)| format!("{name:<28}{value}\n")));
+        let all_s: f64 = summary.stages.iter().map(|stage| stage.time_s).sum();
+        for StageTime { stage, time_s } in summary.stages.iter().filter(|stage| stage.time_s > 0.0) {
+            let (share, name) = (100.0 * time_s / all_s, format!("stage {stage}"));
+            text += &format!("{name:<28}{:.2} ms, {share:.1} %\n", 1e3 * time_s);
+        }
     }
     // A closed output does not end the program.
     let _ = if to_file {

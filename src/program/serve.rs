@@ -66,6 +66,9 @@ pub(crate) struct ServeArguments {
     /// Fraction of a core for measuring the errors of live sessions; 0 disables that [default: 0.02]
     #[arg(long, value_name = "FRACTION")]
     audit_share: Option<f64>,
+    /// Measure how long each stage of a step takes, which `palpate-client top` shows
+    #[arg(long)]
+    profile: bool,
     /// Keep a journal of each session in this folder: after a crash or an upgrade the server continues the sessions
     /// [default: off]
     #[arg(long, value_name = "DIR")]
@@ -173,6 +176,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     if let Some(share) = arguments.audit_share {
         config.audit_share = share;
     }
+    config.profile |= arguments.profile;
     if let Some(deadline_s) = arguments.shutdown_deadline_s {
         config.shutdown_deadline_s = deadline_s;
     }

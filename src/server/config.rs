@@ -57,6 +57,8 @@ pub struct Config {
     /// Fraction of a core, 0 to 1, for measuring the errors of live sessions; 0 disables the measurement. Default:
     /// 0.02.
     pub audit_share: f64,
+    /// Whether to measure how long each stage of a step takes, for `palpate-client top`. Default: false.
+    pub profile: bool,
     /// Time that open streams have to end at shutdown before they are cut, s, above 0 and at most a day. Default: 5.
     pub shutdown_deadline_s: f64,
     /// Duration of a tool's lease if the client requests none, s, above 0 and at most `limits.lease_s`. Default: 2.
@@ -102,6 +104,7 @@ impl Default for Config {
             threads: 0,
             network_threads: 0,
             audit_share: 0.02,
+            profile: false,
             shutdown_deadline_s: 5.0,
             lease_s: 2.0,
             idle_session_s: 900.0,

@@ -121,6 +121,9 @@ async fn run(
     let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
     info!(bytes = budget.bytes(), "memory that callers share");
     let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
+    if config.profile {
+        pacer.measure_stages();
+    }
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
     for name in catalog.foreign_names(&config.limits) {

@@ -8,7 +8,7 @@ use palpate_realtime::{RunState, SessionHandle};
 use palpate_session::wire;
 use palpate_tissue::Model;
 use palpate_tissue::scene::Named;
-use palpate_tissue::scene::record::AuditedError;
+use palpate_tissue::scene::record::{AuditedError, StageTime};
 use palpate_tissue::select::audit::Origin;
 
 /// Returns the current state of a session as a message.
@@ -58,12 +58,17 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
         scene_name: model.scene.name.clone(),
         points: count(model.len()),
         extent: Some(pb::Extent { top_m: vector(model.shape().top_m()), ..wire::extent(&model.shape().extent()) }),
+        stages: status.stages.into_iter().map(stage_time).collect(),
         audit: audit(handle),
         journal: handle.event_log.as_deref().map(journal),
         playback: handle.playback.as_ref().map(playback),
         ..Default::default()
     };
     with_model(session, model)
+}
+
+fn stage_time(StageTime { stage, time_s }: StageTime) -> pb::StageTime {
+    pb::StageTime { stage: stage.to_owned(), time_s }
 }
 
 /// Returns what a session plays back.

@@ -191,7 +191,15 @@ pub fn compile(case: &RandomScene, assignments: &[String]) -> Result<(Arc<Model>
 pub fn audited_errors(case: &RandomScene, assignments: &[String]) -> Result<[f64; 2], String> {
     let (model, script) = compile(case, assignments)?;
     let (limits, mut output) = (Limits::default(), std::io::sink());
-    let summary = run::run(&model, &script, [false, true], &limits, &mut output, &|| 0.0, &mut |_| {});
+    let summary = run::run(
+        &model,
+        &script,
+        run::RunOptions { audit: true, ..Default::default() },
+        &limits,
+        &mut output,
+        &|| 0.0,
+        &mut |_| {},
+    );
     let error = summary.map_err(|failure| failure.to_string())?.audited_error.ok_or("the run was not audited")?;
     Ok([error.displacement, error.force])
 }

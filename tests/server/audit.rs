@@ -11,7 +11,7 @@ use palpate_proto::pb;
 use palpate_session::Session;
 use palpate_session::audit::Windows;
 use palpate_session::command::{Command, Due};
-use palpate_session::run::run;
+use palpate_session::run::{RunOptions, run};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::{AuditedError, Correction, Summary};
@@ -41,7 +41,16 @@ fn play(scene: &Scene, text: &str, held: bool, audited: bool) -> (Summary, Vec<V
     let script = script(text, scene);
     let mut output = Vec::new();
     let limits = Limits::default();
-    let summary = run(&model(scene), &script, [held, audited], &limits, &mut output, &|| 0.0, &mut |_| {}).unwrap();
+    let summary = run(
+        &model(scene),
+        &script,
+        RunOptions { held, audit: audited, profile: None },
+        &limits,
+        &mut output,
+        &|| 0.0,
+        &mut |_| {},
+    )
+    .unwrap();
     let lines = String::from_utf8(output).unwrap();
     let lines = lines.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
     (summary, lines.filter(|line| line.get("time_s").is_some()).collect())

@@ -98,7 +98,7 @@ fn top(arguments: &[&str]) -> Output {
 async fn top_shows_sessions_as_a_table_and_as_json() {
     // While it is built a tissue would come to rest.
     client_program();
-    let server = TestServer::start(&[]);
+    let server = TestServer::start(&["--profile"]);
     let (running, paused) = (server.paper(false).await, server.paper(true).await);
     let mut touch = TestTouch::hold(&server, &running).await;
     // Now more and now less, all the while: it would come to rest.
@@ -120,6 +120,7 @@ async fn top_shows_sessions_as_a_table_and_as_json() {
     assert_eq!((&first["streams"], &first["points"]), (&1.into(), &961.into()));
     assert_eq!(first["held_tools"][0]["holder"], "test");
     assert!(first["steps_per_s"].as_f64().unwrap() > 0.0 && first["awake_points"].as_f64().unwrap() > 0.0);
+    assert!(first["stages_us_per_step"]["sweep"].as_f64().unwrap() > 0.0, "{first}");
     assert_eq!(
         (&second["session_id"], &second["state"], &second["step"]),
         (&paused.into(), &"paused".into(), &0.into())
@@ -127,6 +128,7 @@ async fn top_shows_sessions_as_a_table_and_as_json() {
     let table = top(&[&server.url, "--once"]);
     let table = String::from_utf8(table.stdout).unwrap();
     assert!(table.contains("2 sessions (1 running") && table.contains("0: test"), "{table}");
+    assert!(table.contains(" µs a step: "), "{table}");
     assert!(!table.contains('\u{1b}'), "no terminal, no colours");
     // In a pipe whose reader has seen enough.
     let mut child = Command::new(client_program())

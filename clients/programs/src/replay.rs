@@ -470,6 +470,7 @@ async fn play(
         computed_fraction: measured.computed as f64 / (script.steps * points as u64) as f64,
         guard_events: 0,
         final_hash: final_hash.unwrap_or_default(),
+        stages: Vec::new(),
         network: Some(network.clone()),
     };
     write_line(&mut output, &Line::Summary(&summary)).map_err(written)?;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use palpate_client::{Channel, describe};
 use palpate_proto::pb::session_service_client::SessionServiceClient;
-use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState};
+use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState, StageTime};
 use palpate_refusal::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
@@ -38,12 +38,21 @@ struct SessionRow {
     session: Session,
     steps_per_s: f64,
     overruns_per_s: f64,
+    /// The time of each stage per step since the last query, µs; empty unless the server measures it.
+    stages_us: Vec<(String, f64)>,
 }
 
 /// Steps and overruns of each session at a moment.
 struct StepCounts {
     at: Instant,
-    counts: BTreeMap<String, (u64, u64)>,
+    counts: BTreeMap<String, SessionCounts>,
+}
+
+/// The counts of a session from which rates follow.
+struct SessionCounts {
+    steps: u64,
+    overruns: u64,
+    stages: Vec<StageTime>,
 }
 
 /// Shows a server's sessions until it is interrupted or its output is closed.
@@ -102,16 +111,25 @@ async fn look(
 ) -> Result<(Vec<SessionRow>, StepCounts), tonic::Status> {
     let listed = sessions.list_sessions(ListSessionsRequest {}).await?.into_inner().sessions;
     let at = Instant::now();
-    let counts =
-        listed.iter().map(|session| (session.session_id.clone(), (session.step, session.overrun_count))).collect();
+    let counts = |session: &Session| SessionCounts {
+        steps: session.step,
+        overruns: session.overrun_count,
+        stages: session.stages.clone(),
+    };
+    let counts = listed.iter().map(|session| (session.session_id.clone(), counts(session))).collect();
     let row = |session: Session| {
         // A new session has no rate yet.
-        let before = seen.and_then(|seen| Some((seen.at, seen.counts.get(&session.session_id)?)));
-        let (steps_per_s, overruns_per_s) = before.map_or((0.0, 0.0), |(before, (steps, overruns))| {
-            let per_s = |count: u64| count as f64 / (at - before).as_secs_f64().max(1e-3);
-            (per_s(session.step.saturating_sub(*steps)), per_s(session.overrun_count.saturating_sub(*overruns)))
-        });
-        SessionRow { session, steps_per_s, overruns_per_s }
+        let Some((before, counts)) = seen.and_then(|seen| Some((seen.at, seen.counts.get(&session.session_id)?)))
+        else {
+            return SessionRow { session, steps_per_s: 0.0, overruns_per_s: 0.0, stages_us: Vec::new() };
+        };
+        let per_s = |count: u64| count as f64 / (at - before).as_secs_f64().max(1e-3);
+        let steps = session.step.saturating_sub(counts.steps);
+        let overruns_per_s = per_s(session.overrun_count.saturating_sub(counts.overruns));
+        let stages = session.stages.iter().zip(&counts.stages);
+        let us = |now: &StageTime, then: &StageTime| 1e6 * (now.time_s - then.time_s) / steps.max(1) as f64;
+        let stages_us = stages.map(|(now, then)| (now.stage.clone(), us(now, then))).collect();
+        SessionRow { steps_per_s: per_s(steps), overruns_per_s, stages_us, session }
     };
     Ok((listed.into_iter().map(row).collect(), StepCounts { at, counts }))
 }
@@ -127,7 +145,8 @@ fn state(session: &Session) -> &'static str {
 }
 
 fn as_json(rows: &[SessionRow]) -> Value {
-    let one = |SessionRow { session, steps_per_s, overruns_per_s }: &SessionRow| {
+    let one = |SessionRow { session, steps_per_s, overruns_per_s, stages_us }: &SessionRow| {
+        let stages: serde_json::Map<_, _> = stages_us.iter().map(|(stage, us)| (stage.clone(), json!(us))).collect();
         let holders = session.held_tools.iter().map(|held| json!({ "tool": held.tool, "holder": held.holder }));
         json!({
             "session_id": session.session_id, "scene": session.scene_name, "state": state(session),
@@ -139,6 +158,7 @@ fn as_json(rows: &[SessionRow]) -> Value {
             "durable_step": session.journal.as_ref().and_then(|journal| journal.durable_step),
             "journal_lag_s": session.journal.as_ref().map(|journal| journal.lag_s),
             "journal_fault": session.journal.as_ref().map(|journal| &journal.fault),
+            "stages_us_per_step": stages,
             "audit": session.audit.as_ref().map(audit), "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
         })
     };
@@ -191,7 +211,7 @@ fn table(server: &str, rows: &[SessionRow], most: usize) -> String {
     if rows.len() > most {
         rows.sort_by_key(|row| std::cmp::Reverse((row.session.awake_points, row.session.streams)));
     }
-    for SessionRow { session, steps_per_s, .. } in rows.iter().take(most) {
+    for SessionRow { session, steps_per_s, stages_us, .. } in rows.iter().take(most) {
         let holders: Vec<_> = session.held_tools.iter().map(|held| format!("{}: {}", held.tool, held.holder)).collect();
         let newest = session.audit.as_ref().and_then(|audit| audit.newest_error.as_ref());
         let error = newest.map_or("-".to_owned(), |error| format!("{:.1e}", error.displacement.max(error.force)));
@@ -213,11 +233,24 @@ fn table(server: &str, rows: &[SessionRow], most: usize) -> String {
             session.streams,
             printable(holders.join(", ")),
         );
+        text += &stages(stages_us);
     }
     if rows.len() > most {
         let _ = writeln!(text, "and {} more", rows.len() - most);
     }
     text
+}
+
+/// Returns a line with the time of each stage of a step, largest first; empty without any.
+fn stages(stages_us: &[(String, f64)]) -> String {
+    let all_us = stages_us.iter().fold(0.0, |sum, (_, us)| sum + us);
+    if all_us <= 0.0 {
+        return String::new();
+    }
+    let mut stages: Vec<_> = stages_us.iter().filter(|(_, us)| *us > 0.0).collect();
+    stages.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let share = |(stage, us): &&(String, f64)| format!("{} {:.0} %", printable(stage), 100.0 * us / all_us);
+    format!("    {all_us:.1} µs a step: {}\n", stages.iter().map(share).collect::<Vec<_>>().join(", "))
 }
 
 #[cfg(test)]
@@ -231,7 +264,12 @@ mod tests {
         let name = || "a\x1b[2J\r\n\u{9b}\u{202e}z".to_owned();
         let held_tools = vec![HeldTool { holder: name(), ..Default::default() }];
         let session = Session { session_id: name(), scene_name: name(), held_tools, ..Default::default() };
-        let rows = [SessionRow { session, steps_per_s: 0.0, overruns_per_s: 0.0 }];
+        let rows = [SessionRow {
+            session,
+            steps_per_s: 0.0,
+            overruns_per_s: 0.0,
+            stages_us: vec![("sweep".to_owned(), 3.0), ("contact".to_owned(), 1.0)],
+        }];
         let table = table("here", &rows, 10);
         assert!(table.lines().count() == 4 && table.matches("a?[2J????z").count() == 3, "{table:?}");
         let json = printable_json(as_json(&rows));

@@ -231,6 +231,7 @@ pub(crate) async fn play(
         largest_displacement_m: f64::NAN,
         peak_reaction_n: f64::NAN,
         curves: Curves::default(),
+        stages: Vec::new(),
         network: None,
     };
     recorded.finish(run, summary);

@@ -7,7 +7,7 @@ use std::sync::mpsc::channel;
 use std::time::Instant;
 
 use palpate_refusal::{Reason, Refusal};
-use palpate_session::run::{RunEvent, run_with};
+use palpate_session::run::{RunEvent, RunOptions, run_with};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::Model;
 use palpate_tissue::scene;
@@ -96,7 +96,7 @@ impl RunRecord {
 fn play(
     model: &Arc<Model>,
     script: &Script,
-    how: [bool; 2],
+    options: RunOptions,
     stop: &AtomicBool,
 ) -> Result<RunRecord, SimulationFailure> {
     let script = script.bound(&model.scene)?;
@@ -105,7 +105,7 @@ fn play(
     recorded.points.reserve(records.saturating_mul(script.sample_points.len() * OF_POINT).min(1 << 24));
     let begun = Instant::now();
     let clock_s = || begun.elapsed().as_secs_f64();
-    let summary = run_with(model, &script, how, &limits(), &clock_s, &mut |news| {
+    let summary = run_with(model, &script, options, &limits(), &clock_s, &mut |news| {
         match news {
             RunEvent::Run(run) => recorded.header = Some(run.clone()),
             RunEvent::Record(record) => recorded.add(&record),
@@ -165,7 +165,7 @@ pub(crate) fn run<'py>(
     audit: bool,
 ) -> PyResult<Bound<'py, PyAny>> {
     let (given, script) = (Given::of(scene)?, Script::given(script)?);
-    let played = work(py, |stop| play(&given.model(stop)?, &script, [held, audit], stop))?;
+    let played = work(py, |stop| play(&given.model(stop)?, &script, RunOptions { held, audit, profile: None }, stop))?;
     played.map_err(of_run)?.given(py)
 }
 
@@ -218,7 +218,8 @@ pub(crate) fn study<'py>(
                             break;
                         };
                         let played = given.model(stop).map_err(SimulationFailure::from);
-                        let played = played.and_then(|model| play(&model, script, [held, false], stop));
+                        let played = played
+                            .and_then(|model| play(&model, script, RunOptions { held, ..Default::default() }, stop));
                         if tell.send((case, played)).is_err() {
                             break;
                         }

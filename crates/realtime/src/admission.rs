@@ -205,7 +205,8 @@ impl Pacer {
         let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
         // Allocated before the lock is taken, which every call needs.
-        let session = memory::attempt("sheet.points", session)?;
+        let mut session = memory::attempt("sheet.points", session)?;
+        session.time_stages(self.measures_stages.load(Ordering::Relaxed).then_some(now_ns));
         let (model, step) = (session.model().clone(), session.step_count());
         let running = running && session.hold_reason().is_none();
         let number = {
@@ -230,6 +231,7 @@ impl Pacer {
             recoveries: Vec::new(),
             awake_points: 0,
             path_counts: [0; 3],
+            stages: Vec::new(),
             lapsed_leases: 0,
             model: model.clone(),
         };

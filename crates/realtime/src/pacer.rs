@@ -1,7 +1,7 @@
 //! The sessions of a server, and the threads that step them.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::thread::JoinHandle;
 
@@ -44,6 +44,7 @@ pub struct Pacer {
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
     pub(super) event_logs: OnceLock<Arc<EventLogQueue>>,
+    pub(super) measures_stages: AtomicBool,
     /// The moment until which the server may step its sessions and answer for them; none at first.
     pub fence: Arc<Fence>,
 }
@@ -122,6 +123,7 @@ impl Pacer {
             viewers: Mutex::new(BTreeMap::new()),
             numbers: Mutex::new(0),
             event_logs: OnceLock::new(),
+            measures_stages: AtomicBool::new(false),
             fence,
         }))
     }
@@ -130,6 +132,12 @@ impl Pacer {
     /// the queue of the logs, which the caller must empty; a further call returns the same queue.
     pub fn record_events(&self) -> Arc<EventLogQueue> {
         self.event_logs.get_or_init(Arc::default).clone()
+    }
+
+    /// Makes each session that is created from now on measure how long the stages of its steps take
+    /// ([`Status::stages`](super::status::Status::stages)).
+    pub fn measure_stages(&self) {
+        self.measures_stages.store(true, Ordering::Relaxed);
     }
 
     /// Returns whether a session has this ID, including one that is still being handed to this server.

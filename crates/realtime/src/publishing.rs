@@ -15,6 +15,7 @@ use palpate_session::Sample;
 use palpate_session::budget::{Account, Work};
 use palpate_session::local_model::StiffnessJob;
 use palpate_session::recovery::describe;
+use palpate_session::run::stage_times;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::surface::{MESH_ROW, Snapshot};
 use palpate_tissue::Hashing;
@@ -141,6 +142,9 @@ impl SessionTask {
             (status.recovery_count, status.recoveries) = (recovery_count, self.session.recoveries().list());
         }
         status.awake_points = self.session.tissue().awake_points();
+        if let Some(profile) = self.session.tissue().stage_times() {
+            status.stages = stage_times(profile);
+        }
         status.path_counts = path_counts;
         status.lapsed_leases = self.lapsed_leases;
         status.dilation = self.dilation;

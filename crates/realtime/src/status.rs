@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::clock::Dilation;
 use palpate_session::schedule::Schedule;
 use palpate_tissue::Model;
-use palpate_tissue::scene::record::Recovery;
+use palpate_tissue::scene::record::{Recovery, StageTime};
 
 /// Whether a session's simulated time advances. A running session at rest or frozen is [`RunState::Running`] too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,6 +53,9 @@ pub struct Status {
     pub awake_points: usize,
     /// Counts of limited steps, dropped poses and releases: see [`palpate_session::Session::path_counts`].
     pub path_counts: [u64; 3],
+    /// The time of each stage of a step since the session came to this server; empty unless it is measured
+    /// ([`Pacer::measure_stages`](super::Pacer::measure_stages)).
+    pub stages: Vec<StageTime>,
     /// Number of tools whose lease expired, since the session came to this server.
     pub lapsed_leases: u64,
     /// The present tissue. It differs from the first one after a

@@ -23,7 +23,7 @@ pub struct AcceptedBatch {
 
 /// What a batch brings to a tool, so far.
 #[derive(Clone, Copy)]
-struct Coming {
+struct ToolCommands {
     tool: u32,
     /// The last sequence number.
     sequence: u64,
@@ -35,14 +35,14 @@ struct Coming {
 
 /// What a batch brings to each of its tools, by ascending tool. A batch for one tool takes no memory of its own.
 #[derive(Default)]
-struct ToolsComing(SmallVec<[Coming; 1]>);
+struct BatchTools(SmallVec<[ToolCommands; 1]>);
 
-impl ToolsComing {
-    fn of(&self, tool: u32) -> Option<Coming> {
+impl BatchTools {
+    fn of(&self, tool: u32) -> Option<ToolCommands> {
         self.0.binary_search_by_key(&tool, |coming| coming.tool).ok().map(|at| self.0[at])
     }
 
-    fn set(&mut self, coming: Coming) {
+    fn set(&mut self, coming: ToolCommands) {
         match self.0.binary_search_by_key(&coming.tool, |coming| coming.tool) {
             Ok(at) => self.0[at] = coming,
             Err(at) => self.0.insert(at, coming),
@@ -81,7 +81,7 @@ impl Intake {
             let message = "commands of this lease are being taken in: send them one call after another";
             return Err(Refusal::new(Reason::OutOfTurn, "", message));
         }
-        let mut last = ToolsComing::default();
+        let mut last = BatchTools::default();
         for command in &mut commands {
             let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
             let lease = lease.ok_or_else(|| {
@@ -105,10 +105,10 @@ impl Intake {
             }
             let newest = before.map_or(sequence, |before| before.max(sequence));
             let count = coming.map_or(0, |coming| coming.count) + 1;
-            last.set(Coming { tool: command.tool, sequence: newest, count, tip_radius_m });
+            last.set(ToolCommands { tool: command.tool, sequence: newest, count, tip_radius_m });
         }
         // A limit per tool, so that no holder fills the queue for the others.
-        for Coming { tool, count, .. } in &last.0 {
+        for ToolCommands { tool, count, .. } in &last.0 {
             let waiting = self.queue.waiting_of(*tool);
             if waiting + count > self.rules.limits.queued_commands_per_tool {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");

@@ -233,6 +233,11 @@ impl Session {
         &*self.tissue
     }
 
+    /// Begins to measure how long each stage of a step takes ([`Tissue::time_stages`]).
+    pub fn time_stages(&mut self, now_ns: Option<fn() -> u64>) {
+        self.tissue.time_stages(now_ns);
+    }
+
     /// Returns the number of steps done, with skipped ones. A recovery does not lower it.
     pub fn step_count(&self) -> u64 {
         self.tissue.step_count()

@@ -5,17 +5,17 @@ use std::collections::BTreeMap;
 use super::command::Due;
 use super::lease::QueueKey;
 
-/// Commands by their key: step, then order of arrival. A single one takes no memory of its own: at 1 kHz a command waits
+/// WaitingCommands by their key: step, then order of arrival. A single one takes no memory of its own: at 1 kHz a command waits
 /// alone for the next step.
 #[derive(Debug, Default)]
-struct Commands {
+struct WaitingCommands {
     /// The only command; `None` if there are none or several.
     single: Option<(QueueKey, Due)>,
     /// Several commands; empty if there is one.
     several: BTreeMap<QueueKey, Due>,
 }
 
-impl Commands {
+impl WaitingCommands {
     fn len(&self) -> usize {
         self.several.len() + usize::from(self.single.is_some())
     }
@@ -56,10 +56,10 @@ impl Commands {
     }
 }
 
-/// Commands that no longer take effect, as [`Intake::close`](super::intake::Intake::close) returns them. Dropping
+/// WaitingCommands that no longer take effect, as [`Intake::close`](super::intake::Intake::close) returns them. Dropping
 /// this frees them, which takes time: do so without a lock.
 #[derive(Debug, Default)]
-pub struct Discarded(Vec<Commands>);
+pub struct Discarded(Vec<WaitingCommands>);
 
 impl Discarded {
     /// Returns whether there is nothing to free.
@@ -71,16 +71,16 @@ impl Discarded {
 /// The queue of waiting commands and ends of leases.
 #[derive(Debug, Default)]
 pub(super) struct Queue {
-    /// Commands to the tools that are held.
-    by_tool: BTreeMap<u32, Commands>,
+    /// WaitingCommands to the tools that are held.
+    by_tool: BTreeMap<u32, WaitingCommands>,
     /// Ends of leases.
-    endings: Commands,
-    /// Commands of leases that have ended, by tool. [`Queue::free_some`] frees them piece by piece.
-    discarded: Vec<Commands>,
+    endings: WaitingCommands,
+    /// WaitingCommands of leases that have ended, by tool. [`Queue::free_some`] frees them piece by piece.
+    discarded: Vec<WaitingCommands>,
     /// Number of commands in `by_tool`, and of those in `discarded`.
     waiting: usize,
     left_over: usize,
-    /// Commands of all tools that are due, before they are sorted; kept for its buffer.
+    /// WaitingCommands of all tools that are due, before they are sorted; kept for its buffer.
     due: Vec<(QueueKey, Due)>,
 }
 
@@ -97,7 +97,7 @@ impl Queue {
 
     /// Returns the number of commands of a tool that wait.
     pub(super) fn waiting_of(&self, tool: u32) -> usize {
-        self.by_tool.get(&tool).map_or(0, Commands::len)
+        self.by_tool.get(&tool).map_or(0, WaitingCommands::len)
     }
 
     /// Adds an entry.
@@ -131,7 +131,7 @@ impl Queue {
     /// Discards everything, to be freed later. Returns the number of commands.
     pub(super) fn discard_all(&mut self) -> usize {
         let tools: Vec<u32> = self.by_tool.keys().copied().collect();
-        self.endings = Commands::default();
+        self.endings = WaitingCommands::default();
         tools.into_iter().map(|tool| self.discard(tool)).sum()
     }
 
@@ -181,7 +181,7 @@ impl Queue {
     /// Returns everything that waits, in order of effect.
     pub(super) fn in_order(&self) -> Vec<(QueueKey, &Due)> {
         let all = self.by_tool.values().chain([&self.endings]);
-        let mut all: Vec<_> = all.flat_map(Commands::iter).map(|(key, due)| (*key, due)).collect();
+        let mut all: Vec<_> = all.flat_map(WaitingCommands::iter).map(|(key, due)| (*key, due)).collect();
         all.sort_unstable_by_key(|(key, _)| *key);
         all
     }

@@ -8,9 +8,9 @@ use super::simulation::{Simulation, SimulationFailure};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
-use palpate_tissue::scene::record::{Line, Record, Run, Summary, far_warning, write_line};
+use palpate_tissue::scene::record::{Line, Record, Run, StageTime, Summary, far_warning, write_line};
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::{Model, Tissue};
+use palpate_tissue::{Model, StageTimes, StepStage, Tissue};
 
 /// Returns the first line of a run: the names of scene and script, the stepping of the model (integrator, substeps
 /// per step, precision, steps per second), and the version of this program.
@@ -40,13 +40,23 @@ pub enum RunEvent<'t> {
     Summary(&'t Summary),
 }
 
+/// How a script is played.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RunOptions {
+    /// Whether forces and moves are played as commands that keep them constant over each step, like those of a client;
+    /// otherwise as continuous functions.
+    pub held: bool,
+    /// Whether a second simulation in f64 with a quarter of the substep (a twin) runs beside, to measure errors.
+    pub audit: bool,
+    /// A clock that never goes back, ns: the summary then has the time of each stage of a step.
+    pub profile: Option<fn() -> u64>,
+}
+
 /// Plays `script` on `model` from rest and writes its records, as JSON Lines, to `output`. Returns the summary, which
 /// is also the last line. Blocks until the script ends.
 ///
-/// The first flag, `held`: forces and moves are played as commands that keep them constant over each step, not as
-/// continuous functions. The second flag, `audit`: a second simulation in f64 with a quarter of the substep (a twin)
-/// runs beside; the summary contains the differences between the two, and with `[stepping] correct` the run corrects
-/// errors above the tolerance. `clock_s` returns a monotonic time, s; the summary has the time of the run's own steps
+/// With `audit`, the summary contains the differences between the run and its twin, and with `[stepping] correct` the run
+/// corrects errors above the tolerance. `clock_s` returns a monotonic time, s; the summary has the time of the run's own steps
 /// by it. `progress` is called with the number of steps done: 0, 1024, 2048 and so on.
 ///
 /// # Errors
@@ -57,21 +67,19 @@ pub enum RunEvent<'t> {
 pub fn run(
     model: &Arc<Model>,
     script: &Script,
-    [held, audit]: [bool; 2],
+    options: RunOptions,
     limits: &Limits,
     output: &mut dyn Write,
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Summary, SimulationFailure> {
-    run_with(model, script, [held, audit], limits, clock_s, &mut |told| write(output, progress, told))
+    run_with(model, script, options, limits, clock_s, &mut |told| write(output, progress, told))
 }
 
 /// Plays `script` on `model` from rest for a program that uses the records as values, in the calling thread. Calls
 /// `tell` with each event, in the order of [`RunEvent`]. Returns the summary, which is also the last event.
 ///
-/// The first flag, `held`: forces and moves are played as commands that keep them constant over each step, not as
-/// continuous functions. The second flag, `audit`: a twin in f64 with a quarter of the substep runs beside, as
-/// [`run`] describes. `clock_s` returns a monotonic time, s; the summary's time excludes `tell` and the twin.
+/// `clock_s` returns a monotonic time, s; the summary's time excludes `tell` and the twin.
 ///
 /// # Errors
 /// - [`SimulationFailure::Held`]: the session stops for good ([`Session::hold_reason`](super::Session::hold_reason));
@@ -82,13 +90,15 @@ pub fn run(
 pub fn run_with(
     model: &Arc<Model>,
     script: &Script,
-    [held, audit]: [bool; 2],
+    options: RunOptions,
     limits: &Limits,
     clock_s: &dyn Fn() -> f64,
     tell: &mut dyn FnMut(RunEvent<'_>) -> std::io::Result<()>,
 ) -> Result<Summary, SimulationFailure> {
+    let RunOptions { held, audit, profile } = options;
     let (mut twin, mut corrections) = (audit.then(|| Twin::new(model, (!held).then_some(script))), Vec::new());
     let mut simulation = Simulation::playing(model, script, held, limits)?;
+    simulation.session.time_stages(profile);
     tell(RunEvent::Run(&header(model, &script.name)))?;
     let mut written: std::io::Result<()> = Ok(());
     let mut windows = (twin.is_some() && model.scene.stepping.correct).then(Windows::default);
@@ -205,8 +215,16 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         largest_displacement_m: 0.0,
         peak_reaction_n: 0.0,
         curves: Curves::default(),
+        stages: tissue.stage_times().map(stage_times).unwrap_or_default(),
         network: None,
     }
+}
+
+/// Returns the time of each stage of a profile, in the order of a step.
+pub fn stage_times(profile: &StageTimes) -> Vec<StageTime> {
+    #[allow(clippy::cast_precision_loss)]
+    let time_s = |stage| profile.stage_ns(stage) as f64 * 1e-9;
+    StepStage::NAMES.iter().map(|(stage, name)| StageTime { stage: name, time_s: time_s(*stage) }).collect()
 }
 
 #[cfg(test)]
@@ -214,6 +232,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use std::cell::Cell;
     use std::path::Path;
+    use std::sync::atomic::{AtomicU64, Ordering};
 
     use super::*;
 
@@ -262,7 +281,8 @@ mod tests {
             let clock_s = || now_s.replace(now_s.get() + 0.5);
             let script = script(&model, more);
             let summary =
-                run(&model, &script, [false, false], &Limits::default(), &mut output, &clock_s, &mut |_| {}).unwrap();
+                run(&model, &script, RunOptions::default(), &Limits::default(), &mut output, &clock_s, &mut |_| {})
+                    .unwrap();
             let passed_s = now_s.get() - begun_s;
             assert!(summary.wall_s > 0.0 && summary.wall_s <= passed_s, "{} of {passed_s} s", summary.wall_s);
             let point_substeps = summary.points as f64 * summary.substeps as f64;
@@ -276,7 +296,8 @@ mod tests {
         // While a clock stands still, no time is counted.
         let script = script(&model, "");
         let summary =
-            run(&model, &script, [false, false], &Limits::default(), &mut Vec::new(), &|| 1e6, &mut |_| {}).unwrap();
+            run(&model, &script, RunOptions::default(), &Limits::default(), &mut Vec::new(), &|| 1e6, &mut |_| {})
+                .unwrap();
         assert_eq!(summary.wall_s, 0.0);
         // At the very end it changes nothing.
         let late = run_with("[[tissue]]\nat_s = 0.02\nanchor_stiffness_n_per_m = 50.0\n");
@@ -292,7 +313,7 @@ mod tests {
         let script = Script::parse("test", &text, Path::new(""), &model.scene, &Limits::default()).unwrap();
         let mut output = Vec::new();
         let summary =
-            run(&model, &script, [false, false], &Limits::default(), &mut output, &|| 0.0, &mut |_| {}).unwrap();
+            run(&model, &script, RunOptions::default(), &Limits::default(), &mut output, &|| 0.0, &mut |_| {}).unwrap();
         let mut largest_n = 0.0_f64;
         for line in String::from_utf8(output).unwrap().lines() {
             let record: serde_json::Value = serde_json::from_str(line).unwrap();
@@ -307,5 +328,29 @@ mod tests {
             "{} {largest_n}",
             summary.peak_reaction_n
         );
+    }
+
+    #[test]
+    fn a_profile_has_the_time_of_each_stage_and_changes_nothing() {
+        static NOW_NS: AtomicU64 = AtomicU64::new(0);
+        // Each look at the clock takes a millisecond.
+        let clock: fn() -> u64 = || NOW_NS.fetch_add(1_000_000, Ordering::Relaxed);
+        let model =
+            Model::parse("paper", palpate_tissue::scene::PAPER, &["sheet.points=[9, 9]", "stepping.substeps=2"])
+                .unwrap();
+        let script = "duration_s = 0.05\nsample_every_s = 0.05\n[[force]]\nat_m = [0.1, 0.1]\nforce_n = [0.0, 0.0, -0.5]\n\
+                      falloff_per_m = 20.0\nfalloff_offset = 0.0\nprofile = { type = \"constant\" }\n";
+        let script = Script::parse("test", script, Path::new(""), &model.scene, &Limits::default()).unwrap();
+        let run = |profile| {
+            let options = RunOptions { profile, ..Default::default() };
+            run(&model, &script, options, &Limits::default(), &mut Vec::new(), &|| 0.0, &mut |_| {}).unwrap()
+        };
+        let (plain, measured) = (run(None), run(Some(clock)));
+        assert!(plain.stages.is_empty());
+        assert_eq!(plain.final_hash, measured.final_hash);
+        let time_s = |name: &str| measured.stages.iter().find(|stage| stage.stage == name).unwrap().time_s;
+        // Two substeps in each of 50 steps; a sheet has no pressure.
+        assert_eq!((time_s("sweep"), time_s("contact"), time_s("pressure")), (0.1, 0.1, 0.0));
+        assert_eq!(time_s("guard"), 0.05);
     }
 }

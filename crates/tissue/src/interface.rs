@@ -12,8 +12,8 @@ use crate::kernel::field::BLOCK;
 use crate::scene::profile::Poke;
 use crate::select::audit_window::{Mark, WindowInputs};
 use crate::shape::PointId;
-use crate::state::profile::Profile;
 use crate::state::saved::SavedTissue;
+use crate::state::stage_times::StageTimes;
 use crate::tools::applied_force::Push;
 use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
@@ -153,9 +153,9 @@ pub trait Tissue: Send {
     fn change(&mut self, model: &Arc<Model>);
     /// Begins to measure how long each stage of a step takes, by a clock that never goes back, ns; `None` ends it. Without
     /// a clock it costs nothing.
-    fn set_profile(&mut self, now_ns: Option<fn() -> u64>);
-    /// Returns what was measured since [`Tissue::set_profile`]; `None` without a clock.
-    fn profile(&self) -> Option<&Profile>;
+    fn time_stages(&mut self, now_ns: Option<fn() -> u64>);
+    /// Returns what was measured since [`Tissue::time_stages`]; `None` without a clock.
+    fn stage_times(&self) -> Option<&StageTimes>;
     /// Requests an audit of a window of steps, which begins at the next checkpoint. `inputs` is the memory in
     /// which the tools' inputs are recorded; it is emptied. A new request replaces one that waits or runs,
     /// without a report.

@@ -168,9 +168,22 @@ pub struct Summary {
     /// Displacement and force of the first tool or point over time ([`Record::first`]). Not written.
     #[serde(skip)]
     pub curves: Curves,
+    /// The time of each stage of a step, summed over the run; not written unless it was measured.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub stages: Vec<StageTime>,
     /// The additional measurements of a replay; `None` for a run.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
+}
+
+/// The time that a stage of the steps has taken.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StageTime {
+    /// The stage: `sleep` (which tiles wake and sleep), `pressure` (of a volume), `force` (force-controlled tools),
+    /// `sweep` (the springs), `grasp`, `contact` (position-controlled tools), or `guard` (checks and checkpoints).
+    pub stage: &'static str,
+    /// Its time, s.
+    pub time_s: f64,
 }
 
 impl Summary {

@@ -56,7 +56,7 @@ impl<T: Real> TissueState<T> {
             substeps_done: self.substeps_done,
             points_done: self.points_done,
             known_volume_change: Cell::new(Some(self.volume_change())),
-            profile: None,
+            stage_times: None,
         }))
     }
 
@@ -137,7 +137,7 @@ impl<T: Real> TissueState<T> {
         if !matches!(self.audit_window, AuditWindow::Off) {
             sheet.audit_window = AuditWindow::Dropped;
         }
-        sheet.profile.clone_from(&self.profile);
+        sheet.stage_times.clone_from(&self.stage_times);
         sheet.exchange_model(model);
         Some(sheet)
     }

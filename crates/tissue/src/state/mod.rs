@@ -3,10 +3,10 @@
 pub(crate) mod context;
 mod copy;
 mod guarded;
-pub(crate) mod profile;
 mod reading;
 pub(crate) mod restore;
 pub mod saved;
+pub(crate) mod stage_times;
 mod step;
 #[cfg(test)]
 mod subnormal;

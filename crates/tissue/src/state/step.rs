@@ -8,7 +8,7 @@ use crate::scheme::family::Family;
 use crate::sleep::criterion::{put_to_sleep, wake_moved, wake_pressed, wake_pushed};
 use crate::sleep::tiles::CHECK_STEPS;
 use crate::state::context::StepContext;
-use crate::state::profile::StepStage;
+use crate::state::stage_times::StepStage;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;
@@ -43,8 +43,8 @@ impl<T: Real> TissueState<T> {
     }
 
     fn begin_step(&mut self) {
-        if let Some(profile) = &mut self.profile {
-            profile.begin();
+        if let Some(times) = &mut self.stage_times {
+            times.begin();
         }
         self.known_volume_change.set(None);
         self.substeps_done += u64::from(self.plan.substeps);
@@ -171,8 +171,8 @@ impl<T: Real> TissueState<T> {
 
     /// Ends a stage of the profile, if there is one.
     pub(super) fn ended(&mut self, stage: StepStage) {
-        if let Some(profile) = &mut self.profile {
-            profile.end(stage);
+        if let Some(times) = &mut self.stage_times {
+            times.end(stage);
         }
     }
 }

@@ -26,9 +26,9 @@ use crate::select::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::shape::PointId;
 use crate::sleep::criterion::add_sleeping;
 use crate::sleep::tiles::SleepTiles;
-use crate::state::profile::{Profile, StepStage};
 use crate::state::reading::PointReader;
 use crate::state::saved::SavedTissue;
+use crate::state::stage_times::{StageTimes, StepStage};
 use crate::tools::applied_force::{Applied, Push, Term};
 use crate::tools::contact::{Contacts, TangentInput, Tool, ToolContact, displacement_m};
 use crate::tools::prescribed::{Grasp, Prescribed};
@@ -74,7 +74,7 @@ pub(crate) struct TissueState<T: Real> {
     /// By how much a volume has grown, if it was computed since the last change of the state.
     pub(super) known_volume_change: Cell<Option<f64>>,
     /// How long the stages of a step take, if that is asked for.
-    pub(super) profile: Option<Profile>,
+    pub(super) stage_times: Option<StageTimes>,
 }
 
 impl<T: Real> TissueState<T> {
@@ -101,7 +101,7 @@ impl<T: Real> TissueState<T> {
             substeps_done: 0,
             points_done: 0,
             known_volume_change: Cell::new(None),
-            profile: None,
+            stage_times: None,
             plan,
         }
     }
@@ -382,12 +382,12 @@ impl<T: Real> Tissue for TissueState<T> {
         self.state.hash_blocks(&self.tables.layout, |point| self.tiles.has_moved(point), blocks, hasher);
     }
 
-    fn set_profile(&mut self, now_ns: Option<fn() -> u64>) {
-        self.profile = now_ns.map(Profile::new);
+    fn time_stages(&mut self, now_ns: Option<fn() -> u64>) {
+        self.stage_times = now_ns.map(StageTimes::new);
     }
 
-    fn profile(&self) -> Option<&Profile> {
-        self.profile.as_ref()
+    fn stage_times(&self) -> Option<&StageTimes> {
+        self.stage_times.as_ref()
     }
 
     fn save(&self) -> SavedTissue {

@@ -35,16 +35,16 @@ impl StepStage {
 /// The time that each stage of a tissue's steps has taken since the profile began
 /// ([`Tissue::profile`](crate::Tissue::profile)).
 #[derive(Debug, Clone)]
-pub struct Profile {
+pub struct StageTimes {
     /// A clock that never goes back, ns.
     now_ns: fn() -> u64,
     last_ns: u64,
     stages_ns: [u64; StepStage::NAMES.len()],
 }
 
-impl Profile {
+impl StageTimes {
     pub(super) fn new(now_ns: fn() -> u64) -> Self {
-        Profile { now_ns, last_ns: now_ns(), stages_ns: [0; StepStage::NAMES.len()] }
+        StageTimes { now_ns, last_ns: now_ns(), stages_ns: [0; StepStage::NAMES.len()] }
     }
 
     /// Begins a step: the time since the last stage belongs to none.
