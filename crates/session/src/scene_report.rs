@@ -12,7 +12,7 @@ use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::scene::BodyKind;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::scheme::Oscillator;
+use palpate_tissue::scheme::Relaxation;
 use palpate_tissue::shape::{Deepest, RestShape};
 
 /// Bounds of plausible values. Beyond them a unit is probably wrong.
@@ -118,7 +118,7 @@ impl Laws<'_> {
 impl Prospect {
     /// Computes the expected behaviour of a tissue, and of a script on it.
     pub(super) fn new(model: &Model, script: Option<&Script>) -> Self {
-        let (shape, sheet) = (model.shape(), Oscillator::of(&model.scene));
+        let shape = model.shape();
         let size_m = shape.extent().size_m();
         let radius_m = Tip::default().radius_m;
         let mut laws = Laws { model, known: Vec::new() };
@@ -134,7 +134,7 @@ impl Prospect {
             no_law: "its force law takes too much work",
             deepest_m: half_m.min(reach_m),
             is_by_law: reach_m < half_m,
-            rest_s: rest_s(&sheet),
+            rest_s: Relaxation::of(&model.scene).rest_s(AT_REST),
             forces: script.map_or(Vec::new(), |script| forces(model, script, &mut laws)),
             tips: script.map_or(Vec::new(), |script| tips(shape, script, &mut laws)),
             warnings: Vec::new(),
@@ -214,23 +214,6 @@ impl Prospect {
         }
         doubts
     }
-}
-
-/// Returns the time at which the slowest vibration has decayed to [`AT_REST`], s. That is the vibration of all
-/// points together straight out of the sheet: springs at rest do not pull there, only anchor springs do.
-fn rest_s(sheet: &Oscillator) -> Result<f64, &'static str> {
-    let Oscillator { mass_kg, damping_n_s_per_m, anchor_stiffness_n_per_m, .. } = *sheet;
-    if damping_n_s_per_m <= 0.0 {
-        return Err("never: there is no damping");
-    }
-    if anchor_stiffness_n_per_m <= 0.0 {
-        return Err("unknown: without anchor springs nothing but fixed points pulls the tissue back");
-    }
-    let (decay_per_s, square) = (0.5 * damping_n_s_per_m / mass_kg, anchor_stiffness_n_per_m / mass_kg);
-    // Above critical damping the tissue creeps back.
-    let beyond = decay_per_s * decay_per_s - square;
-    let slowest_per_s = if beyond > 0.0 { square / (decay_per_s + beyond.sqrt()) } else { decay_per_s };
-    Ok(-AT_REST.ln() / slowest_per_s)
 }
 
 /// Returns the depth of each force of a script. On a uniform tissue, a disc with the area of the falloff presses with
@@ -459,19 +442,6 @@ mod tests {
         let stiffness = found.stiffness_n_per_m().unwrap();
         // Some twelve points share a disc of 5 mm, each on an anchor spring of 5 N/m.
         assert!((50.0..80.0).contains(&stiffness), "{stiffness} N/m");
-    }
-
-    #[test]
-    fn what_creeps_back_takes_longer_and_what_nothing_damps_never_rests() {
-        let sheet = |damping_n_s_per_m: f64, anchor_stiffness_n_per_m: f64| {
-            let scene = &Model::parse("paper", palpate_tissue::scene::PAPER, &[]).unwrap().scene;
-            Oscillator { mass_kg: 1.0, damping_n_s_per_m, anchor_stiffness_n_per_m, ..Oscillator::of(scene) }
-        };
-        // The slower of the roots of s² + 10 s + 9 is −1.
-        assert!((rest_s(&sheet(10.0, 9.0)).unwrap() - 100.0_f64.ln()).abs() < 1e-9);
-        assert!((rest_s(&sheet(2.0, 9.0)).unwrap() - 100.0_f64.ln()).abs() < 1e-9);
-        assert!(rest_s(&sheet(0.0, 9.0)).unwrap_err().starts_with("never"));
-        assert!(rest_s(&sheet(1.0, 0.0)).unwrap_err().starts_with("unknown"));
     }
 
     #[test]

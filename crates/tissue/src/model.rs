@@ -8,7 +8,7 @@ use crate::body::surface::GraphFault;
 use crate::kernel::field::{BLOCK, Layout};
 use crate::scene::{Integrator, Lanes, Precision, Scene};
 use crate::scheme::stability;
-use crate::scheme::{Oscillator, QuadratureNode, Scheme};
+use crate::scheme::{Oscillator, QuadratureNode, Relaxation, Scheme};
 use crate::shape::{self, PointId, RestShape};
 
 /// The immutable half of a tissue, compiled from a scene: points, springs, and the scheme with its substep.
@@ -157,11 +157,14 @@ impl Model {
         })
     }
 
-    /// Returns the sleep tolerance of the tiles. Without anchor springs, nothing bounds how far an omitted
-    /// force would move a tissue; then only tiles that do not move at all may sleep.
+    /// Returns the sleep tolerance of the tiles. Where nothing pulls a tissue back, nothing bounds how far an
+    /// omitted force would move it; then only tiles that do not move at all may sleep.
     pub(super) fn tile_tolerance(&self) -> f64 {
-        let bounded = self.scene.anchor_stiffness_n_per_m > 0.0;
-        if bounded { self.sleep_tolerance } else { self.sleep_tolerance.min(f64::MIN_POSITIVE) }
+        if Relaxation::of(&self.scene).is_bounded() {
+            self.sleep_tolerance
+        } else {
+            self.sleep_tolerance.min(f64::MIN_POSITIVE)
+        }
     }
 
     /// Returns the memory of the model itself, bytes, approximately: tables of a mesh included, states of

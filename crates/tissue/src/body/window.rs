@@ -5,6 +5,7 @@ use glam::{DMat3, DVec2, DVec3};
 use crate::body::Places;
 use crate::body::footprint::Footprint;
 use crate::model::Model;
+use crate::scheme::Relaxation;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
 pub(crate) const REACHES: f64 = 6.0;
@@ -260,14 +261,13 @@ fn of_mesh(model: &Model, slots: &[usize], free: &[bool]) -> Vec<Spring> {
 }
 
 /// Returns the distance from the middle of a disc of `radius_m` at which points still notice it, in spacings h:
-/// a/h + `REACHES`·√(k/K″) + 2; infinite without anchor springs. Beyond a disc displacements fall as e^{−r/l}
-/// with l = h·√(k/K″), at which a membrane of springs and its foundation are in balance, k·h²·u″ = K″·u.
+/// a/h + `REACHES`·l/h + 2, with l = h·√(k/K″) the length over which displacements fall by e ([`Relaxation::reach`]);
+/// infinite without anchor springs.
 fn half_window(model: &Model, radius_m: f64) -> f64 {
     let scene = &model.scene;
     let springs = &scene.springs;
     let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
-    let reach = (stiffest / scene.anchor_stiffness_n_per_m).sqrt().max(1.0);
-    radius_m / model.unit_m + REACHES * reach + 2.0
+    radius_m / model.unit_m + REACHES * Relaxation::of(scene).reach(stiffest) + 2.0
 }
 
 /// Returns the distance from the middle of a disc at which points still notice it, m: a + 6·h·√(k/K″) + 2h, with a =

@@ -86,6 +86,12 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         self.spring_bound_n_per_m(springs, anchor_n_per_m)
     }
 
+    /// Returns the stiffness that pulls a displaced point of the reference mass back wherever the others are, N/m, with
+    /// the reference K″ `anchor_n_per_m`; 0 if nothing does.
+    fn restoring_n_per_m(&self, anchor_n_per_m: f64) -> f64 {
+        anchor_n_per_m
+    }
+
     /// Returns the fastest vibration of the springs, and where it is; `None` where all points are alike.
     fn fastest(&self) -> Option<StiffnessBound> {
         None

@@ -14,6 +14,7 @@ mod lagged_damping;
 mod matrix;
 pub(crate) mod observer;
 mod oscillator;
+mod relaxation;
 mod rk4;
 pub mod stability;
 
@@ -21,6 +22,7 @@ pub use central::TwoStep;
 pub use exponential::Multistep;
 pub use family::QuadratureNode;
 pub use oscillator::Oscillator;
+pub use relaxation::Relaxation;
 pub use rk4::Rk4;
 
 use std::any::Any;

@@ -20,7 +20,7 @@ use glam::DVec3;
 use crate::model::Model;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
-use crate::scheme::Oscillator;
+use crate::scheme::Relaxation;
 use crate::select::audit_window::Replay;
 pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
 
@@ -162,16 +162,9 @@ impl Model {
 
     /// Returns the steps in a window: until the slowest vibration has lost half its amplitude, at most 0.25 s,
     /// at least 1 step. The window then lasts until the next checkpoint of the guard.
-    ///
-    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case γ = (C
-    /// − √(C² − 4mK))/2m for the slower part. K is that of the anchor springs alone: the slowest vibration
-    /// bends the tissue least.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn window_steps(&self) -> u64 {
-        let Oscillator { mass_kg, damping_n_s_per_m: c, anchor_stiffness_n_per_m: k, .. } = Oscillator::of(&self.scene);
-        // The difference without cancellation.
-        let root = (c * c - 4.0 * mass_kg * k).max(0.0).sqrt();
-        let decay_per_s = if root > 0.0 { 2.0 * k / (c + root) } else { c / (2.0 * mass_kg) };
+        let decay_per_s = Relaxation::of(&self.scene).decay_per_s();
         let window_s = (std::f64::consts::LN_2 / decay_per_s).min(LONGEST_S);
         (window_s * self.scene.stepping.rate_hz).ceil().max(1.0) as u64
     }

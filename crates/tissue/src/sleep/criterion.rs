@@ -8,8 +8,8 @@ use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::model::{Model, Plan};
 use crate::scene::Precision;
-use crate::scheme::Oscillator;
 use crate::scheme::stability;
+use crate::scheme::{Oscillator, Relaxation};
 use crate::sleep::tiles::SleepTiles;
 use crate::state::context::StepContext;
 use crate::tools::applied_force::Applied;
@@ -26,7 +26,7 @@ pub(crate) fn wake_pushed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, app
         if stiffness > 0.0 {
             tiles.largest = tiles.largest.max(change.peak_n() / (stiffness * spacing_m));
         }
-        let least_n = model.scene.anchor_stiffness_n_per_m * tiles.wake_threshold(&model.scene) * spacing_m;
+        let least_n = Relaxation::of(&model.scene).restoring_n_per_m() * tiles.wake_threshold(&model.scene) * spacing_m;
         tiles.pushed(&change, spacing_m, least_n);
     }
 }
@@ -87,7 +87,12 @@ pub(crate) fn add_sleeping<T: Real>(
 pub(crate) fn wake_pressed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, volume_change: f64, far: f64) {
     let Some(volume) = model.places.volume() else { return };
     let stiffness = model.scene.volume_stiffness_pa * volume.stretch_m;
-    tiles.wake_pressed(volume_change, &volume.reaches, stiffness, far * model.scene.anchor_stiffness_n_per_m);
+    tiles.wake_pressed(
+        volume_change,
+        &volume.reaches,
+        stiffness,
+        far * Relaxation::of(&model.scene).restoring_n_per_m(),
+    );
 }
 
 /// Puts calm tiles to sleep, under the pressure that belongs to `volume_change`.

@@ -34,6 +34,7 @@ use crate::kernel::region::{Marks, Region, sides_of, tile_of, tiles};
 use crate::memory;
 use crate::model::Model;
 use crate::scene::Scene;
+use crate::scheme::Relaxation;
 use crate::state::saved::{SavedTile, SavedTiles, ensure, unsound};
 use crate::tools::applied_force::ForceChange;
 use palpate_refusal::Result;
@@ -285,11 +286,13 @@ impl<T: Real> SleepTiles<T> {
     /// Returns ε_w, the movement of a neighbour that wakes a tile, in spacings.
     pub(crate) fn wake_threshold(&self, scene: &Scene) -> f64 {
         let epsilon = self.epsilon();
-        let ratio = scene.anchor_stiffness_n_per_m / scene.springs.stiffness_n_per_m / scene.body.kind().unevenness();
+        let relaxation = Relaxation::of(scene);
+        let restoring = relaxation.restoring_n_per_m();
+        let ratio = restoring / scene.springs.stiffness_n_per_m / scene.body.kind().unevenness();
         // Without springs nothing passes from tile to tile.
         let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
         // A difference in the last digit is rounding noise.
-        if scene.anchor_stiffness_n_per_m > 0.0 { unnoticed.max(T::EPSILON * self.largest) } else { unnoticed }
+        if relaxation.is_bounded() { unnoticed.max(T::EPSILON * self.largest) } else { unnoticed }
     }
 
     fn epsilon_of(&self, largest: f64) -> f64 {
