@@ -8,6 +8,7 @@ use std::time::{Duration, SystemTime};
 use rcgen::{CertificateParams, DnType, ExtendedKeyUsagePurpose, KeyPair, KeyUsagePurpose};
 
 use super::{Failure, write_file};
+use palpate_tissue::files;
 
 #[derive(clap::Args)]
 pub(crate) struct CertificateArguments {
@@ -80,11 +81,11 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> Result<(), Failure> {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(failed(e)),
         _ => {}
     }
-    let mut options = std::fs::OpenOptions::new();
-    options.write(true).create_new(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    options.open(path).and_then(|mut file| file.write_all(pem.as_bytes())).map_err(failed)
+    files::private_options()
+        .create_new(true)
+        .open(path)
+        .and_then(|mut file| file.write_all(pem.as_bytes()))
+        .map_err(failed)
 }
 
 /// Returns the names of the new files, and the commands that use them.

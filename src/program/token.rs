@@ -40,11 +40,7 @@ pub(crate) fn token(arguments: &TokenArguments) -> Result<(), Failure> {
         identity::KnownCallers::parse(path, &format!("{text}\n{entry}"))?;
     }
     let refuse = |e: std::io::Error| Failure::Refused(format!("{}: can't be written: {e}", path.display()));
-    let mut options = std::fs::OpenOptions::new();
-    options.append(true).create(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    let mut file = options.open(path).map_err(refuse)?;
+    let mut file = files::private_options().append(true).create(true).open(path).map_err(refuse)?;
     // One write, because a server may read the file at any moment.
     file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
     writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))

@@ -118,6 +118,11 @@ impl ClusterConfig {
             }
             return Ok(());
         }
+        if !cfg!(target_os = "linux") {
+            let message = "a fleet needs Linux: elsewhere a server can't tell for how long the machine was suspended, and could \
+                           act for a session that another server has";
+            return Err(Refusal::new(Reason::NotAvailable, "cluster.etcd", message));
+        }
         let missing = |field: &str, why: &str| Err(Refusal::new(Reason::Missing, field, format!("is missing: {why}")));
         let Some(advertise) = &self.advertise else {
             return missing(

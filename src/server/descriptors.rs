@@ -1,5 +1,6 @@
 //! File descriptors: raises the process's limit, and limits the number of connections accordingly.
 
+#[cfg(unix)]
 use tracing::warn;
 
 /// Descriptors reserved for files: scenes, scripts, textures, certificates and tokens, several at once.

@@ -13,9 +13,8 @@ pub fn now_ns() -> u64 {
     now.duration_since(origin).as_nanos() as u64
 }
 
-/// Returns the processor time of the calling thread, ns. Outside Linux it returns the elapsed time, as [`now_ns`]
-/// does.
-#[allow(clippy::cast_sign_loss)]
+/// Returns the processor time of the calling thread, ns.
+#[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation)]
 pub fn thread_time_ns() -> u64 {
     #[cfg(target_os = "linux")]
     {
@@ -23,7 +22,9 @@ pub fn thread_time_ns() -> u64 {
         time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
     }
     #[cfg(not(target_os = "linux"))]
-    now_ns()
+    {
+        cpu_time::ThreadTime::try_now().map_or_else(|_| now_ns(), |time| time.as_duration().as_nanos() as u64)
+    }
 }
 
 /// Length of the window over which time dilation is measured, ns.

@@ -87,6 +87,10 @@ pub(super) enum Request {
     Panic,
 }
 
+/// The system's tick on Windows, ns.
+#[cfg(windows)]
+const TICK_NS: u64 = 15_625_000;
+
 /// Inbox of a stepping thread.
 #[derive(Default)]
 pub(super) struct Inbox {
@@ -141,6 +145,18 @@ impl Inbox {
                     if rest_ns == 0 {
                         return None;
                     }
+                    // On Windows a condition variable wakes with the system's tick, every 15.6 ms. The sleep of a
+                    // thread is exact; a request then waits for the end of the sleep, when its step is due anyway.
+                    #[cfg(windows)]
+                    if rest_ns < 2 * TICK_NS {
+                        drop(state);
+                        std::thread::sleep(Duration::from_nanos(rest_ns.min(TICK_NS / 16)));
+                        now = now_ns();
+                        state = lock(&self.state);
+                        continue;
+                    }
+                    #[cfg(windows)]
+                    let rest_ns = rest_ns - 2 * TICK_NS;
                     let waited = self.wake.wait_timeout(state, Duration::from_nanos(rest_ns));
                     now = now_ns();
                     waited.unwrap_or_else(PoisonError::into_inner).0

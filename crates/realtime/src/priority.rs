@@ -21,13 +21,13 @@ pub fn thread(name: impl Into<String>) -> Builder {
 }
 
 /// Lowers the priority of the calling thread (niceness 10). If the processors are busy, it gets about a tenth of
-/// the time of a stepping or network thread, and never none. Outside Linux nothing changes.
+/// the time of a stepping or network thread, and never none. Nothing changes except on Linux and Windows.
 pub fn give_way() {
     be_nice(10);
 }
 
 /// Lowers the priority of the calling thread a little (niceness 5): it gets about a third of the time of a stepping
-/// thread if the processors are busy. Outside Linux nothing changes.
+/// thread if the processors are busy. Nothing changes except on Linux and Windows.
 pub fn give_way_a_little() {
     be_nice(5);
 }
@@ -61,11 +61,17 @@ pub fn take_short_turns(turn: Duration) {
     let _ = turn;
 }
 
-/// Sets the niceness of the calling thread, on Linux; elsewhere it would be that of the whole process. A failure is
-/// ignored.
+/// Sets the niceness of the calling thread, on Linux; on Windows its priority: below normal, or the lowest from 10 on.
+/// Elsewhere it would be that of the whole process, and nothing changes. A failure is ignored.
 fn be_nice(niceness: i32) {
     #[cfg(target_os = "linux")]
     let _ = rustix::process::setpriority_process(None, niceness);
-    #[cfg(not(target_os = "linux"))]
+    #[cfg(windows)]
+    {
+        use thread_priority::{ThreadPriority, WinAPIThreadPriority, set_current_thread_priority};
+        let lower = if niceness < 10 { WinAPIThreadPriority::BelowNormal } else { WinAPIThreadPriority::Lowest };
+        let _ = set_current_thread_priority(ThreadPriority::Os(lower.into()));
+    }
+    #[cfg(not(any(target_os = "linux", windows)))]
     let _ = niceness;
 }

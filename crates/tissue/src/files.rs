@@ -1,6 +1,7 @@
-//! Reads files that users name, up to a bound and without waiting forever.
+//! Reads files that users name, up to a bound and without waiting forever; and creates files that only their owner can
+//! access.
 
-use std::fs::File;
+use std::fs::{DirBuilder, File, OpenOptions};
 use std::io::{ErrorKind, Read};
 use std::path::Path;
 use std::time::Duration;
@@ -52,6 +53,28 @@ pub fn read_regular(path: &Path, most: u64) -> Result<Vec<u8>> {
 /// Refuses everything that [`read_regular`] refuses, and bytes that are not UTF-8 ([`Reason::Unreadable`]).
 pub fn read_regular_text(path: &Path, most: u64) -> Result<String> {
     text(path, read_regular(path, most)?)
+}
+
+/// Returns options for writing a file that only its owner can access, if it is created by them: for keys, tokens and
+/// journals. On Windows the file has the access rights of its folder.
+pub fn private_options() -> OpenOptions {
+    let mut options = File::options();
+    options.write(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    options
+}
+
+/// Creates a folder, with those above it, that only its owner can access; a folder that exists stays as it is. On Windows
+/// it has the access rights of the folder above it.
+///
+/// # Errors
+/// Returns the system's error.
+pub fn create_private_folder(path: &Path) -> std::io::Result<()> {
+    let mut builder = DirBuilder::new();
+    #[cfg(unix)]
+    std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
+    builder.recursive(true).create(path)
 }
 
 fn refuse(path: &Path, message: impl Into<String>) -> Refusal {

@@ -1,10 +1,11 @@
 //! Output of `palpate journal`: the standard output or a file.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Write};
 use std::path::Path;
 
 use super::super::Failure;
+use palpate_tissue::files;
 
 /// The standard output, or a file.
 pub(super) fn output(file: Option<&Path>) -> Result<Box<dyn Write>, Failure> {
@@ -15,11 +16,7 @@ pub(super) fn output(file: Option<&Path>) -> Result<Box<dyn Write>, Failure> {
 
 /// Creates a file that only its owner can read and write. Does not overwrite an existing file.
 pub(super) fn new_file(path: &Path) -> Result<File, Failure> {
-    let mut options = OpenOptions::new();
-    options.read(true).write(true).create_new(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    options.open(path).map_err(|e| match e.kind() {
+    files::private_options().read(true).create_new(true).open(path).map_err(|e| match e.kind() {
         ErrorKind::AlreadyExists => Failure::Refused(format!("{}: exists already; give another name", path.display())),
         _ => unwritten(path, &e),
     })

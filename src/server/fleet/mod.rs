@@ -18,6 +18,7 @@ mod member;
 mod migrate;
 mod owned;
 mod peers;
+mod positioned;
 mod receive;
 mod reconcile;
 mod replica;

@@ -1,12 +1,12 @@
 //! The journals of sessions for which this server is the standby: received, written, and synced.
 
 use std::collections::BTreeMap;
-use std::fs::{DirBuilder, File};
-use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::positioned::write_all_at;
 use palpate_proto::pb;
 
 use palpate_realtime::clock::now_ns;
@@ -72,7 +72,7 @@ impl StandBy {
     /// Refuses a folder that can't be used.
     pub(super) fn open(journals: &Path) -> Result<Self> {
         let folder = journals.join(FOLDER);
-        DirBuilder::new().recursive(true).mode(0o700).create(&folder).map_err(|error| unusable(&folder, &error))?;
+        files::create_private_folder(&folder).map_err(|error| unusable(&folder, &error))?;
         let mut kept = BTreeMap::new();
         for file in journal::file::list(&folder).map_err(|error| unusable(&folder, &error))? {
             let bytes = std::fs::metadata(&file.path).map_or(0, |metadata| metadata.len());
@@ -168,12 +168,11 @@ impl StandBy {
             let failed = |error: std::io::Error| unusable(&path, &error);
             let key = (session_id.as_str(), *run);
             if *offset == 0 || !files.contains_key(&key) {
-                let mut options = File::options();
-                let file =
-                    options.write(true).create(true).truncate(*offset == 0).mode(0o600).open(&path).map_err(failed)?;
+                let mut options = files::private_options();
+                let file = options.create(true).truncate(*offset == 0).open(&path).map_err(failed)?;
                 files.insert(key, file);
             }
-            files[&key].write_all_at(bytes, *offset).map_err(failed)?;
+            write_all_at(&files[&key], bytes, *offset).map_err(failed)?;
             let bytes = offset + bytes.len() as u64;
             let kept = ReplicaFile { run: *run, bytes, from: node.to_owned(), stream, since_ns: 0 };
             let before = lock(&self.kept).insert(session_id.clone(), kept);

@@ -5,7 +5,6 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -18,6 +17,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tracing::{info, warn};
 
 use super::peers::why;
+use super::positioned::read_exact_at;
 use super::{Fleet, Standby};
 use crate::server::journals::progress::Grown;
 use palpate_cluster::{placement, rules};
@@ -326,7 +326,7 @@ fn parts(behind: &[Grown], sent: &SentBytes) -> Vec<Vec<pb::MirrorPart>> {
         while offset < *bytes {
             #[allow(clippy::cast_possible_truncation)]
             let mut part = vec![0; (bytes - offset).min(MESSAGE_BYTES) as usize];
-            if file.read_exact_at(&mut part, offset).is_err() {
+            if read_exact_at(&file, &mut part, offset).is_err() {
                 break;
             }
             let length = part.len() as u64;

@@ -1,13 +1,13 @@
 //! The folder of journals: its lock, its files, and syncing them to the disk.
 
-use std::fs::{DirBuilder, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::journal;
+use palpate_tissue::files;
 
 /// Name of the file that the server using the folder locks.
 const LOCK: &str = "lock";
@@ -25,6 +25,8 @@ const MAX_SINGLE: usize = 4;
 /// An open folder of journals, locked against other servers.
 pub(super) struct Folder {
     path: PathBuf,
+    /// The folder itself. On Windows a folder is no file, and needs no syncing.
+    #[cfg(unix)]
     directory: File,
     _lock: File,
 }
@@ -38,7 +40,8 @@ impl Folder {
         let refused =
             |reason, message: String| Refusal::new(reason, "journal", format!("{}: {message}", path.display()));
         let unusable = |error: std::io::Error| refused(Reason::Unreadable, format!("can't be used: {error}"));
-        DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(unusable)?;
+        files::create_private_folder(path).map_err(unusable)?;
+        #[cfg(unix)]
         let directory = File::open(path).map_err(unusable)?;
         let lock = private().truncate(false).open(path.join(LOCK)).map_err(unusable)?;
         let mut tries = 0;
@@ -57,7 +60,12 @@ impl Folder {
                 Err(std::fs::TryLockError::Error(error)) => return Err(unusable(error)),
             }
         }
-        Ok(Folder { path: path.to_owned(), directory, _lock: lock })
+        Ok(Folder {
+            path: path.to_owned(),
+            #[cfg(unix)]
+            directory,
+            _lock: lock,
+        })
     }
 
     /// Returns the folder's path.
@@ -67,7 +75,11 @@ impl Folder {
 
     /// Returns whether the disk has room for journals to grow for a while.
     pub(super) fn has_room(&self) -> bool {
-        rustix::fs::fstatvfs(&self.directory).is_ok_and(|found| found.f_bavail.saturating_mul(found.f_frsize) >= ROOM)
+        #[cfg(unix)]
+        let free = rustix::fs::fstatvfs(&self.directory).map(|found| found.f_bavail.saturating_mul(found.f_frsize));
+        #[cfg(windows)]
+        let free = fs4::available_space(&self.path);
+        free.is_ok_and(|bytes| bytes >= ROOM)
     }
 
     /// Makes all that was written to `files` survive a power failure. `is_new`: some of them were just created.
@@ -82,14 +94,20 @@ impl Folder {
         for file in files {
             file.sync_data()?;
         }
-        if is_new { self.directory.sync_all() } else { Ok(()) }
+        #[cfg(unix)]
+        if is_new {
+            self.directory.sync_all()?;
+        }
+        #[cfg(not(unix))]
+        let _ = is_new;
+        Ok(())
     }
 }
 
 /// Returns options that create a file which only its owner can access.
 fn private() -> OpenOptions {
-    let mut options = File::options();
-    options.write(true).create(true).mode(0o600);
+    let mut options = files::private_options();
+    options.create(true);
     options
 }
 

@@ -26,7 +26,11 @@ fn told_by_the_system() -> Option<u64> {
         (total > 0).then_some(total)
     }
     #[cfg(not(target_os = "linux"))]
-    None
+    {
+        let mut system = sysinfo::System::new();
+        system.refresh_memory();
+        (system.total_memory() > 0).then(|| system.total_memory())
+    }
 }
 
 /// Parses `MemTotal:  16324520 kB`. Returns bytes.
