@@ -271,7 +271,9 @@ mod tests {
             stages_us: vec![("sweep".to_owned(), 3.0), ("contact".to_owned(), 1.0)],
         }];
         let table = table("here", &rows, 10);
-        assert!(table.lines().count() == 4 && table.matches("a?[2J????z").count() == 3, "{table:?}");
+        // A line for the stages, the longest first.
+        assert!(table.lines().count() == 5 && table.matches("a?[2J????z").count() == 3, "{table:?}");
+        assert!(table.ends_with("    4.0 µs a step: sweep 75 %, contact 25 %\n"), "{table:?}");
         let json = printable_json(as_json(&rows));
         assert!(json.lines().count() == 1 && !json.contains(['\x1b', '\u{9b}', '\u{202e}']), "{json:?}");
     }

@@ -112,12 +112,13 @@ pub fn list(library: Option<&Path>) -> Vec<Found> {
         let (is_there, about) = told.unwrap_or_else(|error| (false, error.to_string()));
         Found { name: name.to_owned(), is_there, about }
     };
-    let mut found = vec![
+    let found = [
         told("force-dimension", force_dimension::tell(library)),
         told("openhaptics", open_haptics::tell(library)),
         told("haply", haply::tell()),
     ];
+    let found = found.into_iter();
     #[cfg(target_os = "linux")]
-    found.extend(input::list().into_iter().map(|(name, is_there, about)| Found { name, is_there, about }));
-    found
+    let found = found.chain(input::list().into_iter().map(|(name, is_there, about)| Found { name, is_there, about }));
+    found.collect()
 }

@@ -1,0 +1,77 @@
+#!/bin/sh
+# Builds Palpate for Windows and runs it under Wine: `sh tests/windows/check.sh`, as `make test-windows` does.
+#
+#   The golden hashes, by the same test as on Linux. A script offline: the same records as those of BUILT. A server and its
+#   clients, each on Windows and on Linux. libpalpate.dll from C. The rates of a server's steps and of the loop of a device.
+#
+# BUILT has the programs for this machine [default: target/release].
+set -eu
+
+cd "$(dirname "$0")/../.."
+built=${BUILT:-target/release}
+target=x86_64-pc-windows-gnu
+out=target/windows
+# The standard library is built with the programs: Debian has its sources, and no build of it for Windows.
+export RUSTC_BOOTSTRAP=1 RUSTC=/usr/bin/rustc RUSTDOC=/usr/bin/rustdoc
+export CARGO_TARGET_X86_64_PC_WINDOWS_GNU_LINKER=x86_64-w64-mingw32-gcc CC_x86_64_pc_windows_gnu=x86_64-w64-mingw32-gcc
+export CARGO_TARGET_X86_64_PC_WINDOWS_GNU_RUNNER="sh $PWD/tests/windows/wine.sh"
+export WINEPREFIX="$PWD/$out/wine"
+work=$(mktemp -d)
+server=''
+trap 'if [ -n "$server" ]; then kill "$server" 2>/dev/null; fi; rm -rf "$work"' EXIT
+
+say() { echo "test-windows: $*" >&2; }
+cargo_for_windows() { /usr/bin/cargo "$@" -Zbuild-std=std,panic_unwind --target $target --target-dir $out --release; }
+windows() { sh tests/windows/wine.sh "$@"; }
+
+mkdir -p "$WINEPREFIX"
+windows wineboot --init >/dev/null 2>&1 || true
+x86_64-w64-mingw32-gcc -O -shared tests/windows/bcryptprimitives.c -o "$work/bcryptprimitives.dll" -ladvapi32
+cp "$work/bcryptprimitives.dll" "$WINEPREFIX/drive_c/windows/system32/"
+
+say 'building'
+cargo_for_windows build -p palpate --bin palpate -p palpate-programs --bin palpate-client -p palpate-c
+exe=$out/$target/release
+
+cargo_for_windows test -p palpate --test determinism
+say 'the golden hashes are those of Linux'
+
+for scene in paper liver; do
+    windows "$exe/palpate.exe" run $scene press --output "$work/windows.jsonl" --quiet
+    "$built/palpate" run $scene press --output "$work/linux.jsonl" --quiet
+    # Times of the wall differ, and the lanes of the machine are named.
+    for of in windows linux; do
+        sed 's/"wall_s":[^,]*,"ns_per_point_substep":[^,]*,//; s/"lanes":"[a-z0-9]*"/"lanes":""/' "$work/$of.jsonl" > "$work/$of"
+    done
+    cmp "$work/windows" "$work/linux"
+done
+say 'press on paper and liver: the same records as on Linux'
+
+serve() { # command of a server
+    "$@" serve --listen 127.0.0.1:0 --log error > "$work/serving" &
+    server=$!
+    until grep -q http "$work/serving"; do sleep 0.2; kill -0 "$server"; done
+    url=$(grep -o 'http[^[:space:]]*' "$work/serving" | head -1)
+}
+stop() {
+    kill "$server"
+    wait "$server" 2>/dev/null || true
+    server=''
+}
+hash_of() { grep -o '"final_hash":"[0-9a-f]*"' "$1" | tail -1; }
+
+serve windows "$exe/palpate.exe"
+"$built/palpate-client" replay press --server "$url" --scene liver --output "$work/one.jsonl" --quiet
+windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/both.jsonl" --quiet
+x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include clients/c/examples/look.c -o "$work/look.exe" "$exe/palpate_c.dll" -lm
+x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include clients/c/tests/errors.c -o "$work/errors.exe" "$exe/palpate_c.dll" -lm
+cp "$exe/palpate_c.dll" "$work"
+windows "$work/errors.exe" "$url"
+windows "$work/look.exe" "$url" liver 1
+say 'libpalpate.dll: the tests of errors and the example `look` pass'
+stop
+serve "$built/palpate"
+windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/other.jsonl" --quiet
+stop
+for of in both other; do test "$(hash_of "$work/one.jsonl")" = "$(hash_of "$work/$of.jsonl")"; done
+say 'replays: the same final hash from each client at each server'
