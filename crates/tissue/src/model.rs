@@ -26,7 +26,7 @@ pub struct Model {
     pub(super) fixed: Vec<usize>,
     /// The unit of length: the distance between neighbours, m.
     pub(super) unit_m: f64,
-    /// The places in memory of a mesh's points, and its springs; `None` for a sheet.
+    /// Where the points are in memory, and how they differ.
     pub(super) places: Places,
     /// ω_b = √((λ + K″)/m), rad/s, for a point of the reference mass m; λ is the largest eigenvalue of the
     /// springs' stiffness, K″ that of an anchor spring ([`Oscillator::omega_bound_per_s`]). No vibration is

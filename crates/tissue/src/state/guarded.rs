@@ -44,6 +44,9 @@ impl<T: Real> TissueState<T> {
     /// Does a step and checks it; if a check fails, repeats from the checkpoint with a shorter substep. Returns whether
     /// the step has ended; `may_go_on` is asked during a repetition.
     pub(super) fn guarded_step(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp> {
+        if let Some(times) = &mut self.stage_times {
+            times.begin();
+        }
         if self.repetition.is_none() {
             self.do_step();
             if (self.checkpoint.is_some() || !self.is_at_rest())

@@ -43,9 +43,6 @@ impl<T: Real> TissueState<T> {
     }
 
     fn begin_step(&mut self) {
-        if let Some(times) = &mut self.stage_times {
-            times.begin();
-        }
         self.known_volume_change.set(None);
         self.substeps_done += u64::from(self.plan.substeps);
         wake_pushed(&mut self.tiles, &self.model, &mut self.applied, self.steps);
