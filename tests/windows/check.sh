@@ -30,7 +30,7 @@ x86_64-w64-mingw32-gcc -O -shared tests/windows/bcryptprimitives.c -o "$work/bcr
 cp "$work/bcryptprimitives.dll" "$WINEPREFIX/drive_c/windows/system32/"
 
 say 'building'
-cargo_for_windows build -p palpate --bin palpate -p palpate-programs --bin palpate-client -p palpate-c
+cargo_for_windows build -p palpate -p palpate-programs -p palpate-c --lib --bin palpate --bin palpate-client
 exe=$out/$target/release
 
 cargo_for_windows test -p palpate --test determinism

@@ -1,7 +1,7 @@
 //! The buffers and tables of a tissue's sweeps, and the calls that run a sweep at the machine's vector width.
 #![allow(unsafe_code)]
 
-use std::cell::{Cell, RefCell};
+use std::cell::RefCell;
 use std::sync::Arc;
 
 use crate::body::Places;
@@ -10,7 +10,7 @@ use crate::body::sheet::sweep::Sweep;
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
-use crate::kernel::lanes::{self, Run, Vector, Width};
+use crate::kernel::lanes::{self, SingleWork, Width};
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::springs::{SpringCoefficients, Springs};
@@ -35,8 +35,13 @@ pub(crate) enum Elastic<T> {
 impl<T: Real> Elastic<T> {
     /// Returns the force of all springs, of the extra anchor stiffness and of the pressure on a point, divided
     /// by its relative mass. For a few single points. `volume_change` is the growth of the volume.
-    #[inline(always)]
     pub(crate) fn gather(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
+        lanes::single(&Gathering { springs: self, layout, u, volume_change, point }).unwrap_or_default()
+    }
+
+    /// Returns what [`Elastic::gather`] does, within [`lanes::single`].
+    #[inline(always)]
+    pub(crate) fn gather_inline(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
             Elastic::Mesh(places, unit, pull, factor) => {
@@ -51,19 +56,20 @@ impl<T: Real> Elastic<T> {
 }
 
 /// The gathering of the force on one point.
-struct SinglePoint<'a, T> {
-    tables: &'a SweepTables<T>,
+struct Gathering<'a, T> {
+    springs: &'a Elastic<T>,
+    layout: &'a Layout,
     u: &'a [T],
     volume_change: f64,
     point: [usize; 2],
-    force: Cell<[T; 3]>,
 }
 
-impl<T: Real> Run<T> for SinglePoint<'_, T> {
+impl<T: Real> SingleWork for Gathering<'_, T> {
+    type Output = [T; 3];
+
     #[inline(always)]
-    unsafe fn run<V: Vector<Real = T>>(&self) {
-        let SweepTables { springs, layout, .. } = self.tables;
-        self.force.set(springs.gather(layout, self.u, self.volume_change, self.point));
+    fn compute(&self) -> [T; 3] {
+        self.springs.gather_inline(self.layout, self.u, self.volume_change, self.point)
     }
 }
 
@@ -157,14 +163,6 @@ impl<T: Real> SweepTables<T> {
     /// to `u`; 0 without a volume.
     pub(crate) fn volume_change(&self, u: &Field<T>, tiles: &[usize]) -> f64 {
         self.pressure.as_ref().map_or(0.0, |pressure| pressure.volume_change(self.width, &self.layout, u, tiles))
-    }
-
-    /// Returns the force on a point by [`Elastic::gather`].
-    pub(crate) fn gather(&self, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
-        let single = SinglePoint { tables: self, u, volume_change, point, force: Cell::default() };
-        // SAFETY: the program has no pointers.
-        unsafe { lanes::run_single(&single) };
-        single.force.get()
     }
 
     /// Computes the growth of a volume from the awake tiles, and applies its pressure. Returns the growth.

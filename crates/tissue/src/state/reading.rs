@@ -5,7 +5,7 @@ use glam::DVec3;
 use crate::body::tables::SweepTables;
 use crate::interface::PointState;
 use crate::kernel::field::State;
-use crate::kernel::lanes::Scalar;
+use crate::kernel::lanes::{self, Scalar, SingleWork};
 use crate::kernel::real::Real;
 use crate::model::{Model, Plan};
 use crate::scene::profile::Moment;
@@ -83,27 +83,50 @@ impl<T: Real> PointReader<'_, T> {
     /// Returns displacement, velocity and springs' force of a free point, under the applied force `applied_n`
     /// and that of tips.
     fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
-        let PointReader { model, plan, tables, state, .. } = self;
-        let springs = tables.gather(&state.u, self.volume_change, model.point_of(index));
+        lanes::single(&Observation { reader: self, index, applied_n }).unwrap_or_default()
+    }
+}
+
+/// The observation of a free point.
+struct Observation<'r, 'a, T: Real> {
+    reader: &'r PointReader<'a, T>,
+    index: usize,
+    applied_n: DVec3,
+}
+
+impl<T: Real> SingleWork for Observation<'_, '_, T> {
+    type Output = [DVec3; 3];
+
+    // Loops over indices: iterators are not always inlined, and then run without the caller's instructions.
+    #[allow(clippy::needless_range_loop)]
+    #[inline(always)]
+    fn compute(&self) -> [DVec3; 3] {
+        let Observation { reader, index, applied_n } = *self;
+        let PointReader { model, plan, tables, state, .. } = *reader;
+        let springs =
+            tables.springs.gather_inline(&tables.layout, &state.u, reader.volume_change, model.point_of(index));
         let [i, j] = model.point_of(index);
         let mass = model.relative_mass_at(index);
-        let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
+        let still = reader.steps == 0 || !reader.tiles.region.is_awake(i, j);
         // Without all present forces, a two-step scheme would report a velocity for a point that rests under a
         // tip.
-        let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on(model, index) } else { DVec3::ZERO };
+        let tips_n = if plan.scheme.takes_means() { reader.contacts.steady_on(model, index) } else { DVec3::ZERO };
         let pushed_n = applied_n + tips_n;
         let mut found = [DVec3::ZERO; 3];
-        for (c, n) in springs.into_iter().enumerate() {
+        for c in 0..3 {
+            let n = springs[c];
             let at = c * tables.layout.plane + tables.layout.offset(index);
             let one = Scalar::<f64>;
             let mut kept = [one(0.0); MAX_KEPT];
-            kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
+            for k in 0..state.kept.len() {
+                kept[k] = one(state.kept[k][at].wide());
+            }
             let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
-            let force = one(self.spring_unit * pushed_n[c] / mass);
-            let [u, w, _] = self.observer.observe(u, d, n, &kept, Some(force));
+            let force = one(reader.spring_unit * pushed_n[c] / mass);
+            let [u, w, _] = reader.observer.observe(u, d, n, &kept, Some(force));
             found[0][c] = u.0 * model.unit_m;
             found[1][c] = if still { 0.0 } else { w.0 * model.unit_m / plan.substep_s };
-            found[2][c] = model.spring_force_n(self.spring_unit, index, n.0, state.u[at].wide());
+            found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0, state.u[at].wide());
         }
         found
     }

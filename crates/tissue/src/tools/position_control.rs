@@ -185,7 +185,7 @@ fn states<T: Real>(
         let index = model.index_of(point);
         let at = |c: usize| c * tables.layout.plane + tables.layout.offset(index);
         let vector = |field: &Field<T>| DVec3::from_array([0, 1, 2].map(|c| field[at(c)].wide()));
-        let (u, springs) = (vector(&state.u), tables.gather(&state.u, volume_change, point));
+        let (u, springs) = (vector(&state.u), tables.springs.gather(&tables.layout, &state.u, volume_change, point));
         let spring_n = [0, 1, 2].map(|c| model.spring_force_n(spring_unit, index, springs[c].wide(), u[c]));
         let place_n_per_m = model.scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index);
         let u_m = model.unit_m * u;

@@ -329,14 +329,26 @@ pub(crate) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
     }
 }
 
-/// Runs `program` with fused multiply-add as an instruction, for work on single numbers: without it each operation
-/// would call the C library. The width of `program` is that of plain lanes, and should not matter to it.
-///
-/// # Safety
-/// The pointers of `program` are valid as documented.
-pub(crate) unsafe fn run_single<T: Real>(program: &impl Run<T>) {
-    // SAFETY: `Width::of` leaves no machine without the instruction; the rest is the caller's promise.
-    unsafe { run(Width(Lanes::Plain), program) }
+/// Work on single numbers. Mark [`SingleWork::compute`] and what it calls `#[inline(always)]`.
+pub(crate) trait SingleWork {
+    type Output;
+    fn compute(&self) -> Self::Output;
+}
+
+/// Does `work` with fused multiply-add as an instruction. Elsewhere each such operation calls the C library, which takes
+/// longer, and on Windows (MinGW) rounds twice: then the bits differ.
+pub(crate) fn single<W: SingleWork>(work: &W) -> Option<W::Output> {
+    struct Single<'w, W: SingleWork>(&'w W, Cell<Option<W::Output>>);
+    impl<W: SingleWork> Run<f64> for Single<'_, W> {
+        #[inline(always)]
+        unsafe fn run<V: Vector<Real = f64>>(&self) {
+            self.1.set(Some(self.0.compute()));
+        }
+    }
+    let single = Single(work, Cell::new(None));
+    // SAFETY: the program has no pointers.
+    unsafe { run(Width(Lanes::Plain), &single) };
+    single.1.take()
 }
 
 /// The operations that registers of every kind have under the same name.
