@@ -63,14 +63,21 @@ hash_of() { grep -o '"final_hash":"[0-9a-f]*"' "$1" | tail -1; }
 serve windows "$exe/palpate.exe"
 "$built/palpate-client" replay press --server "$url" --scene liver --output "$work/one.jsonl" --quiet
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/both.jsonl" --quiet
-x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include clients/c/examples/look.c -o "$work/look.exe" "$exe/palpate_c.dll" -lm
-x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include clients/c/tests/errors.c -o "$work/errors.exe" "$exe/palpate_c.dll" -lm
+for example in look touch; do
+    # MinGW has the sleep of POSIX in a library of its own.
+    x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include "clients/c/examples/$example.c" -o "$work/$example.exe" \
+        "$exe/palpate_c.dll" -lm -Wl,-Bstatic -lpthread
+done
 cp "$exe/palpate_c.dll" "$work"
-windows "$work/errors.exe" "$url"
 windows "$work/look.exe" "$url" liver 1
-say 'libpalpate.dll: the tests of errors and the example `look` pass'
+windows "$work/touch.exe" "$url" liver 2
+say 'libpalpate.dll: the examples look and touch run'
+windows "$exe/palpate-client.exe" bridge --server "$url" --scene liver --seconds 5 --json > "$work/bridge.json"
+say "a device at 1 kHz for 5 s, client and server under Wine: $(grep -oE '"(late|missed)_ticks":[0-9]+' "$work/bridge.json" | xargs)"
 stop
 serve "$built/palpate"
+"$built/palpate-client" bridge --server "$url" --scene liver --seconds 5 --json > "$work/bridge.json"
+say "the same on this machine: $(grep -oE '"(late|missed)_ticks":[0-9]+' "$work/bridge.json" | xargs)"
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/other.jsonl" --quiet
 stop
 for of in both other; do test "$(hash_of "$work/one.jsonl")" = "$(hash_of "$work/$of.jsonl")"; done
