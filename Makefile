@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows test-asan test-valgrind test-debug test-mutants need-arm need-windows stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -240,14 +240,20 @@ test-arm: need-arm
 		/usr/bin/cargo test --release --target $(ARM) --target-dir target/arm $(ARM_TESTS)
 
 # Builds for Windows, and runs the result under Wine. tests/windows/check.sh says what.
-need-windows:
-	@test -x /usr/bin/cargo -a -d /usr/lib/rustlib/src && command -v x86_64-w64-mingw32-gcc >/dev/null && \
-		{ command -v wine64 >/dev/null || test -x /usr/lib/wine/wine64; } || \
-		{ echo 'A compiler for Windows or Wine is missing. Debian:' >&2; \
-		echo 'apt-get install rustc-web cargo-web rust-web-src gcc-mingw-w64-x86-64 wine64' >&2; exit 1; }
+need-cross:
+	@test -x /usr/bin/cargo -a -d /usr/lib/rustlib/src || \
+		{ echo 'A compiler for other systems is missing. Debian: apt-get install rustc-web cargo-web rust-web-src' >&2; exit 1; }
+
+need-windows: need-cross
+	@command -v x86_64-w64-mingw32-gcc >/dev/null && { command -v wine64 >/dev/null || test -x /usr/lib/wine/wine64; } || \
+		{ echo 'A linker for Windows or Wine is missing. Debian: apt-get install gcc-mingw-w64-x86-64 wine64' >&2; exit 1; }
 
 test-windows: need-windows build
 	BUILT=$(BUILT) sh tests/windows/check.sh
+
+# Compiles for macOS, without linking.
+check-macos: need-cross
+	sh tests/macos/check.sh
 
 # The sanitizer's runtime comes with the stable compiler, its switch does not.
 # Less optimization, because the checks make the code several times as long.
