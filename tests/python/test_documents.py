@@ -85,7 +85,8 @@ def anchors(path):
 class Links(unittest.TestCase):
     def test_every_link_leads_to_a_file_and_a_heading(self):
         folders = ("docs/**/*.md", "clients/*/README.md", "clients/*/*/README.md", "contrib/**/*.md")
-        pages = {*DOCUMENTS, ROOT / "ARCHITECTURE.md", *(page for folder in folders for page in ROOT.glob(folder))}
+        top = (ROOT / name for name in ("ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md"))
+        pages = {*DOCUMENTS, *top, *(page for folder in folders for page in ROOT.glob(folder))}
         for page in sorted(page for page in pages if "node_modules" not in page.parts):
             for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
                 with self.subTest(f"{page.relative_to(ROOT)}: {link}"):
