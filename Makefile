@@ -21,7 +21,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html 
 
 .PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
-	need-python need-node chaos
+	need-python need-node chaos site
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, plot the force, and keep serving for a browser'
@@ -48,6 +48,7 @@ help:
 	@echo 'make lint            formatting, compiler and clippy warnings, and the counts of tests/counts.py'
 	@echo 'make picture         docs/poke.svg, the curve of the guide'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
+	@echo 'make site            the guide as a site with search, target/site/index.html; fails on a broken link or a missing picture'
 	@echo 'make screenshot      the screenshot of the README'
 	@echo 'make page-states     a picture of each state of the page, at three widths, light and dark, in target/viewer/states'
 	@echo 'make scene-pictures  the pictures of the scenes in the list of the page'
@@ -190,6 +191,15 @@ picture: build
 # The same bytes on every run.
 figures: need-rust
 	$(CARGO) run --release --quiet --example figures
+
+SITE_TOOLS := target/site-tools
+$(SITE_TOOLS)/ready: contrib/site/requirements.txt | need-python
+	$(PYTHON) -m venv $(SITE_TOOLS)
+	$(SITE_TOOLS)/bin/pip install --quiet --disable-pip-version-check -r contrib/site/requirements.txt
+	touch $@
+
+site: $(SITE_TOOLS)/ready
+	$(SITE_TOOLS)/bin/python contrib/site/build.py
 
 screenshot: build viewer
 	cd $(VIEWER) && $(NPM) run screenshot
