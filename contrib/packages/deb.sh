@@ -37,6 +37,7 @@ sed '1,/^\[Unit\]/{/^\[Unit\]/!d}; /^LoadCredential=/d; /^    --tls-key /d; /^  
     s|^DynamicUser=yes|User=palpate\nGroup=palpate|' contrib/palpate.service >"$unit"
 grep -qx 'ExecStart=/usr/bin/palpate serve --config /etc/palpate/palpate.toml' "$unit" || fail 'contrib/palpate.service has another ExecStart than expected'
 {
+    # shellcheck disable=SC2016
     echo '# TLS and tokens: copy this file to /etc/systemd/system/palpate.service.d/tls.conf, and set `listen` in'
     echo '# /etc/palpate/palpate.toml.'
     echo '[Service]'

@@ -9,7 +9,7 @@ need_file "$built/deps/libpalpate_c.a" 'make build'
 folder=libpalpate-$version-linux-$machine
 sh contrib/install.sh "$work/$folder" "$built"
 # The programs are in other packages.
-rm -r "$work/$folder/bin"
+rm -r "${work:?}/$folder/bin"
 if command -v strip >/dev/null; then
     strip --strip-unneeded "$work/$folder/lib/libpalpate.so.$version"
     strip --strip-debug "$work/$folder/lib/libpalpate.a"
