@@ -1,9 +1,8 @@
 //! A SpaceMouse or a gamepad, through the input events of Linux: velocity control of the position, and forces as
 //! rumble, so that anybody can try touch.
 //!
-//! A deflection moves the position at a speed, within a ball of the workspace's radius. No force acts on the hand: it
-//! is felt as rumble, if the device has that. So the position stops by itself when the force comes near the largest
-//! one. Events are read from a path, so a pipe with recorded events works as well.
+//! Forces are felt as rumble, if the device has that. Events are read from a path, so a pipe with recorded events works as
+//! well.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
@@ -16,6 +15,7 @@ use glam::DVec3;
 use palpate_haptics::Device;
 use palpate_haptics::device::UNDECLARED;
 
+use super::velocity_control::{VelocityControl, dead};
 use crate::device::{HapticDevice, Reading};
 
 /// Size of `struct input_event` in bytes: two words of time, then type, code and value.
@@ -33,29 +33,8 @@ const SYN_DROPPED: u16 = 3;
 /// Axes that are used: X, Y, Z, RX, RY, RZ, with equal numbers in EV_REL and EV_ABS.
 const AXES: usize = 6;
 
-/// Speed at full deflection, m/s.
-const SPEED_M_PER_S: f64 = 0.05;
-
-/// Deflection, as a fraction of the largest, that counts as none.
-const DEAD: f64 = 0.08;
-
 /// Time without an event after which a relative axis counts as at rest: such devices do not report 0.
 const RESTS: Duration = Duration::from_millis(100);
-
-/// Longest time by which the position is moved between two readings, s.
-const MAX_S: f64 = 0.02;
-
-/// Fractions of the largest force between which a movement against it becomes slower, until it stops.
-const STOPS: [f64; 2] = [0.6, 0.9];
-
-/// Returns the movement without the part that would increase a force that is already near the largest one.
-fn stopped(moved_m: DVec3, force_n: DVec3) -> DVec3 {
-    let along = force_n.normalize_or_zero();
-    let against_m = moved_m.dot(along).min(0.0);
-    let part = force_n.length() / UNDECLARED.most_n();
-    let left = ((STOPS[1] - part) / (STOPS[1] - STOPS[0])).clamp(0.0, 1.0);
-    moved_m - (1.0 - left) * against_m * along
-}
 
 /// Minimum interval between changes of the rumble, and its duration if it is not renewed.
 const RUMBLE_EVERY: Duration = Duration::from_millis(20);
@@ -131,12 +110,6 @@ impl Map {
             }
         }
     }
-}
-
-/// Removes the dead zone from a deflection; the result is from -1 to 1.
-fn dead(deflection: f64) -> f64 {
-    let beyond = (deflection.abs() - DEAD) / (1.0 - DEAD);
-    if beyond > 0.0 { beyond.min(1.0).copysign(deflection) } else { 0.0 }
 }
 
 /// The state of a device's axes and buttons after the events so far.
@@ -261,10 +234,7 @@ pub(super) struct InputDevice {
     has_told: bool,
     told: InputState,
     rumble: Option<Rumble>,
-    /// The force that was written last, N.
-    force_n: DVec3,
-    place_m: DVec3,
-    moved: Option<Instant>,
+    control: VelocityControl,
 }
 
 impl InputDevice {
@@ -303,8 +273,8 @@ impl InputDevice {
             return Err(io::Error::new(ErrorKind::InvalidInput, message));
         }
         let told = InputState::new(map, ranges);
-        let (part, place_m, force_n) = (Vec::new(), DVec3::ZERO, DVec3::ZERO);
-        Ok(InputDevice { path, events, part, has_told: false, told, rumble, force_n, place_m, moved: None })
+        let control = VelocityControl::default();
+        Ok(InputDevice { path, events, part: Vec::new(), has_told: false, told, rumble, control })
     }
 
     /// Reads the events that have arrived, without waiting.
@@ -345,16 +315,12 @@ impl HapticDevice for InputDevice {
     fn read(&mut self) -> io::Result<Reading> {
         let now = Instant::now();
         self.take(now)?;
-        let passed_s =
-            self.moved.replace(now).map_or(0.0, |before| now.duration_since(before).as_secs_f64().min(MAX_S));
-        let moved_m = stopped(SPEED_M_PER_S * passed_s * self.told.velocity(now), self.force_n);
-        // Stays within the workspace: beyond it the envelope would set the force to zero.
-        self.place_m = (self.place_m + moved_m).clamp_length_max(0.95 * UNDECLARED.workspace_m);
-        Ok(Reading { place_m: self.place_m, enable: self.told.buttons & 1 != 0 })
+        let place_m = self.control.advance(now, self.told.velocity(now));
+        Ok(Reading { place_m, enable: self.told.buttons & 1 != 0 })
     }
 
     fn write(&mut self, force_n: DVec3) -> io::Result<()> {
-        self.force_n = force_n;
+        self.control.set_force(force_n);
         if let Some(rumble) = &mut self.rumble {
             rumble.play(force_n.length() / UNDECLARED.most_n());
         }
@@ -445,20 +411,6 @@ mod tests {
         let mut pad = InputState::new(Map::Gamepad, Map::Gamepad.ranges());
         pad.take(&event(EV_ABS, 5, 255), now).unwrap();
         assert_eq!(pad.velocity(now), -DVec3::Z);
-    }
-
-    #[test]
-    fn nothing_goes_deeper_where_the_force_is_near_the_largest_one() {
-        let most_n = UNDECLARED.most_n();
-        let moved_m = DVec3::new(1e-5, 0.0, -2e-5);
-        assert_eq!(stopped(moved_m, DVec3::ZERO), moved_m);
-        assert_eq!(stopped(moved_m, DVec3::Z * 0.5 * most_n), moved_m);
-        // Half way it is half as fast, then it only slides, and it can always move out.
-        let half_m = stopped(moved_m, DVec3::Z * 0.75 * most_n);
-        assert!((half_m - DVec3::new(1e-5, 0.0, -1e-5)).length() < 1e-12, "{half_m}");
-        let slides_m = stopped(moved_m, DVec3::Z * 0.95 * most_n);
-        assert!((slides_m - DVec3::X * 1e-5).length() < 1e-12, "{slides_m}");
-        assert_eq!(stopped(-moved_m, DVec3::Z * most_n), -moved_m);
     }
 
     #[test]

@@ -8,19 +8,26 @@
 //! | `force-dimension` | omega, delta, sigma, lambda, Falcon | `libdhd` of the Force Dimension SDK |
 //! | `openhaptics` | 3D Systems Touch, Omni, Desktop | `libHD` of OpenHaptics |
 //! | `haply` | Inverse3 | Haply's Inverse Service, by WebSocket |
-//! | `spacemouse`, `gamepad` | position by rate, force by rumble | events of Linux |
+//! | `spacemouse`, `gamepad` | position by rate, force by rumble | events of Linux; elsewhere HID, and the system's gamepads |
 //!
 //! A name may be followed by `:` and which one: the number of a Force Dimension device, the name of an OpenHaptics
-//! configuration, the address of Haply's service, the path of events.
+//! configuration, the address of Haply's service, the path of events or of a HID, the number of a gamepad.
 
 mod check;
 mod force_dimension;
+#[cfg(not(target_os = "linux"))]
+mod gamepad;
 mod haply;
+#[cfg(not(target_os = "linux"))]
+mod hid_space_mouse;
 #[cfg(target_os = "linux")]
 mod input;
 mod loaded;
 mod open_haptics;
 mod placement;
+#[cfg(any(test, not(target_os = "linux")))]
+mod space_mouse_report;
+mod velocity_control;
 
 use std::path::Path;
 
@@ -39,14 +46,14 @@ pub enum DeviceKind {
     OpenHaptics,
     /// Haply's Inverse3, by Haply's service.
     Haply,
-    /// A 3D mouse, by input events of Linux.
+    /// A 3D mouse, by input events of Linux, elsewhere as a HID.
     SpaceMouse,
-    /// A gamepad, by input events of Linux.
+    /// A gamepad, by input events of Linux, elsewhere by the system's gamepads.
     Gamepad,
 }
 
 impl DeviceKind {
-    /// All kinds, with their names for [`open`]; on systems other than Linux, too, where the last two can't be opened.
+    /// All kinds, with their names for [`open`].
     pub const ALL: [(DeviceKind, &'static str); 5] = [
         (DeviceKind::ForceDimension, "force-dimension"),
         (DeviceKind::OpenHaptics, "openhaptics"),
@@ -85,10 +92,9 @@ pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>,
         #[cfg(target_os = "linux")]
         DeviceKind::Gamepad => Box::new(input::InputDevice::open(input::Map::Gamepad, which)?),
         #[cfg(not(target_os = "linux"))]
-        DeviceKind::SpaceMouse | DeviceKind::Gamepad => {
-            let message = "a SpaceMouse and a gamepad are read on Linux only";
-            return Err(std::io::Error::new(std::io::ErrorKind::Unsupported, message).into());
-        }
+        DeviceKind::SpaceMouse => Box::new(hid_space_mouse::SpaceMouse::open(which)?),
+        #[cfg(not(target_os = "linux"))]
+        DeviceKind::Gamepad => Box::new(gamepad::Gamepad::open(which)?),
     })
 }
 
@@ -117,8 +123,10 @@ pub fn list(library: Option<&Path>) -> Vec<Found> {
         told("openhaptics", open_haptics::tell(library)),
         told("haply", haply::tell()),
     ];
-    let found = found.into_iter();
     #[cfg(target_os = "linux")]
-    let found = found.chain(input::list().into_iter().map(|(name, is_there, about)| Found { name, is_there, about }));
-    found.collect()
+    let inputs = input::list();
+    #[cfg(not(target_os = "linux"))]
+    let inputs = hid_space_mouse::list().into_iter().chain(gamepad::list());
+    let inputs = inputs.into_iter().map(|(name, is_there, about)| Found { name, is_there, about });
+    found.into_iter().chain(inputs).collect()
 }
