@@ -1,5 +1,6 @@
 #!/bin/sh
-# Checks that every crate compiles for macOS, on both of its processors: `sh tests/macos/check.sh`, as `make check-macos` does.
+# Checks that libraries and programs compile for macOS, for arm64 and x86-64, except palpate-python: `sh tests/macos/check.sh`, as
+# `make check-macos` does.
 # Nothing is linked or run: the C compiler that a build script asks for is a stub, which writes empty files.
 set -eu
 
@@ -8,7 +9,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 cat > "$work/cc" <<'STUB'
 #!/bin/sh
-# The file after -o, or the archive that `ar` is given.
+# The output: the argument after -o, or an archive (*.a).
 out=''
 for argument in "$@"; do
     case $before in -o) out=$argument ;; esac

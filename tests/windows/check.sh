@@ -1,10 +1,10 @@
 #!/bin/sh
 # Builds Palpate for Windows and runs it under Wine: `sh tests/windows/check.sh`, as `make test-windows` does.
 #
-#   The golden hashes of tests/determinism.rs. Scripts offline: the same records as those of BUILT. A server and its clients, each
-#   under Wine and on Linux. libpalpate from C. How often the loop of a device is late.
+# It compares the golden hashes of tests/determinism.rs, and the records of scripts, with those of Linux. It runs a server and its
+# clients, each under Wine and on Linux, and programs in C with libpalpate. It prints how often the loop of a device is late.
 #
-# BUILT has the programs for this machine [default: target/release].
+# BUILT is the folder of the programs for this machine [default: target/release].
 set -eu
 
 cd "$(dirname "$0")/../.."
@@ -52,7 +52,7 @@ for run in 'paper press' 'paper vertical-60 --held' 'liver press' 'liver stroke'
     set -- $run
     windows "$exe/palpate.exe" run "$@" --output "$work/windows.jsonl" --quiet 2>/dev/null
     "$built/palpate" run "$@" --output "$work/linux.jsonl" --quiet 2>/dev/null
-    # Times of the wall differ.
+    # Wall-clock times differ.
     for of in windows linux; do sed 's/"wall_s":[^,]*,"ns_per_point_substep":[^,]*,//' "$work/$of.jsonl" > "$work/$of"; done
     cmp "$work/windows" "$work/linux"
 done
@@ -74,7 +74,7 @@ serve windows "$exe/palpate.exe"
 "$built/palpate-client" replay press --server "$url" --scene liver --output "$work/one.jsonl" --quiet
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/both.jsonl" --quiet
 for example in look touch; do
-    # MinGW has the sleep of POSIX in a library of its own.
+    # In MinGW, nanosleep is in libpthread.
     x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include "clients/c/examples/$example.c" -o "$work/$example.exe" \
         "$exe/palpate_c.dll" -lm -Wl,-Bstatic -lpthread
 done
@@ -89,6 +89,7 @@ serve "$built/palpate"
 "$built/palpate-client" bridge --server "$url" --scene liver --seconds 5 --json > "$work/bridge.json"
 say "the same on this machine: $(grep -oE '"(late|missed)_ticks":[0-9]+' "$work/bridge.json" | xargs)"
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/other.jsonl" --quiet
+"$built/palpate-client" replay press --server "$url" --scene liver --output "$work/own.jsonl" --quiet
 stop
-for of in both other; do test "$(hash_of "$work/one.jsonl")" = "$(hash_of "$work/$of.jsonl")"; done
+for of in both other own; do test "$(hash_of "$work/one.jsonl")" = "$(hash_of "$work/$of.jsonl")"; done
 say 'replays: the same final hash from each client at each server'

@@ -1,4 +1,4 @@
-//! A gamepad on Windows and macOS, through the system's gamepads: velocity control of the position, and forces as rumble.
+//! A gamepad on Windows and macOS, through gilrs: velocity control of the position, and forces as rumble.
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -41,14 +41,14 @@ fn rumble(pads: &mut Gilrs, id: GamepadId) -> Option<Effect> {
 }
 
 impl Gamepad {
-    /// Opens the gamepad with a number from [`list`], or the first one.
+    /// Opens the gamepad with a number, which [`list`] shows after `gamepad:`, or the first one.
     ///
     /// # Errors
     /// Returns an error if there is no such gamepad, or if the system's gamepads can't be used.
     pub(super) fn open(which: Option<&str>) -> io::Result<Self> {
         let mut pads = Gilrs::new().map_err(failed)?;
         let found = pads.gamepads().map(|(id, _)| id).find(|id| which.is_none_or(|which| id.to_string() == which));
-        let id = found.ok_or_else(|| io::Error::new(io::ErrorKind::NotFound, "no gamepad is connected"))?;
+        let id = found.ok_or_else(|| io::Error::new(io::ErrorKind::NotFound, "no such gamepad is connected"))?;
         let rumble = rumble(&mut pads, id);
         Ok(Gamepad { pads, id, control: VelocityControl::default(), buttons: 0, rumble, rumbled: None })
     }
@@ -81,7 +81,7 @@ impl HapticDevice for Gamepad {
         if let Some(rumble) = &self.rumble
             && self.rumbled.is_none_or(|before| before.elapsed() >= RUMBLE_EVERY)
         {
-            // A gamepad that fails to rumble is noticed by its events.
+            // Errors are ignored here: `read` reports a gamepad that was unplugged.
             let _ = rumble.set_gain((force_n.length() / UNDECLARED.most_n()).clamp(0.0, 1.0) as f32);
             self.rumbled = Some(Instant::now());
         }
@@ -97,7 +97,7 @@ impl HapticDevice for Gamepad {
     }
 }
 
-/// Returns the gamepads: their names for `open`, whether they are there, and a description.
+/// Returns the gamepads: their names for [`super::open`], whether they are there, and a description.
 pub(super) fn list() -> Vec<(String, bool, String)> {
     let none = |about: String| vec![("gamepad".to_owned(), false, about)];
     match Gilrs::new() {

@@ -32,7 +32,7 @@ impl SpaceMouse {
         let mut devices =
             api.device_list().filter(|found| is_space_mouse(found.vendor_id(), found.product_string().unwrap_or("")));
         let found = devices.find(|found| which.is_none_or(|which| found.path().to_string_lossy() == which));
-        let none = || io::Error::new(io::ErrorKind::NotFound, "no spacemouse is connected");
+        let none = || io::Error::new(io::ErrorKind::NotFound, "no such spacemouse is connected");
         let device = found.ok_or_else(none)?.open_device(&api).map_err(failed)?;
         device.set_blocking_mode(false).map_err(failed)?;
         Ok(SpaceMouse { device, reported: Reported::default(), control: VelocityControl::default() })
@@ -70,7 +70,7 @@ impl HapticDevice for SpaceMouse {
     }
 }
 
-/// Returns the devices: their names for `open`, whether they are there, and a description.
+/// Returns the devices: their names for [`super::open`], whether they are there, and a description.
 pub(super) fn list() -> Vec<(String, bool, String)> {
     let none = |about: String| vec![("spacemouse".to_owned(), false, about)];
     let api = match hidapi::HidApi::new() {

@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use super::velocity_control::dead;
 
-/// 3Dconnexion; and Logitech, which sold its devices before, with their names.
+/// 3Dconnexion, and Logitech, which sold these devices earlier; a Logitech device is recognized by its name.
 const VENDORS: [u16; 2] = [0x256f, 0x046d];
 const NAMES: [&str; 4] = ["3Dconnexion", "SpaceMouse", "SpaceNavigator", "SpacePilot"];
 
@@ -19,12 +19,12 @@ const FULL: f64 = 350.0;
 pub(super) struct Reported {
     /// The translation: to the right, towards the operator, and down, as fractions of the largest.
     axes: [f64; 3],
-    /// Bit 0 requests forces, bit 1 is the clutch.
+    /// Bit 0 (the first button) requests forces; bit 1 is the clutch.
     pub(super) buttons: u32,
 }
 
 impl Reported {
-    /// Applies a report, as it is read: its number, then its content. Others than those of axes and buttons do nothing.
+    /// Applies a report, as it is read: its number, then its content. Other reports have no effect.
     pub(super) fn take(&mut self, report: &[u8]) {
         match report {
             [1, axes @ ..] if axes.len() >= 6 => {
@@ -43,7 +43,7 @@ impl Reported {
     }
 }
 
-/// Returns whether a device of this vendor and product name is a SpaceMouse.
+/// Returns whether a device of this vendor and product name counts as a SpaceMouse: every one of 3Dconnexion does.
 pub(super) fn is_space_mouse(vendor: u16, product: &str) -> bool {
     vendor == VENDORS[0] || vendor == VENDORS[1] && NAMES.iter().any(|name| product.contains(name))
 }

@@ -1,7 +1,7 @@
-//! Velocity control of a position: a deflection moves it at a speed, within a ball of the workspace's radius. For devices
-//! that exert no force, such as a SpaceMouse or a gamepad.
+//! Velocity control of a position: a deflection moves it at a speed, within a ball of 0.95 of the workspace's radius. For
+//! devices that exert no force, such as a SpaceMouse or a gamepad.
 //!
-//! No force acts on the hand, so the position stops by itself when the force comes near the largest one.
+//! No force acts on the hand, so movement against a force stops when the force comes near the largest one.
 
 use std::time::Instant;
 
@@ -14,7 +14,7 @@ const SPEED_M_PER_S: f64 = 0.05;
 /// Deflection, as a fraction of the largest, that counts as none.
 const DEAD: f64 = 0.08;
 
-/// Longest time by which the position is moved between two readings, s.
+/// Longest time between two readings that moves the position, s.
 const MAX_S: f64 = 0.02;
 
 /// Fractions of the largest force between which a movement against it becomes slower, until it stops.
@@ -30,7 +30,7 @@ pub(super) struct VelocityControl {
 }
 
 impl VelocityControl {
-    /// Sets the force near whose largest size the position stops, N.
+    /// Sets the present force, N. Near the largest force, movement against it stops.
     pub(super) fn set_force(&mut self, force_n: DVec3) {
         self.force_n = force_n;
     }

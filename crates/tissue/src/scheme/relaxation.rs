@@ -1,10 +1,10 @@
-//! How a displaced tissue comes back to rest: how fast, and how far a disturbance is noticed. Everything that needs the
-//! stiffness of a foundation for this asks here.
+//! How a displaced tissue comes back to rest: how fast, and how far a disturbance is noticed. All code that needs the
+//! stiffness of the foundation for this takes it from here.
 
 use crate::scene::Scene;
 
-/// How a displaced tissue comes back to rest, for a point of the reference mass. Of all vibrations the slowest decides: it
-/// bends the tissue least, so that only what holds each point by itself pulls it back
+/// How a displaced tissue comes back to rest, for a point of the reference mass. The slowest vibration decides. It hardly
+/// bends the tissue, so only each point's own anchor pulls it back
 /// ([`BodyKind::restoring_n_per_m`](crate::scene::BodyKind::restoring_n_per_m)).
 #[derive(Debug, Clone, Copy)]
 pub struct Relaxation {
@@ -19,7 +19,7 @@ impl Relaxation {
         let kind = scene.body.kind();
         Relaxation {
             mass_kg: kind.point_mass_kg(),
-            // A zero without its sign: a division by it gives +∞.
+            // Adding 0.0 turns −0.0 into +0.0, so that dividing by it gives +∞.
             damping_n_s_per_m: scene.damping_n_s_per_m + 0.0,
             restoring_n_per_m: kind.restoring_n_per_m(scene.anchor_stiffness_n_per_m) + 0.0,
         }
@@ -48,7 +48,7 @@ impl Relaxation {
     /// Returns the time at which the slowest vibration has decayed to a `part` (below 1) of its amplitude, s.
     ///
     /// # Errors
-    /// Returns why there is none, for people: nothing damps the tissue, or nothing pulls it back.
+    /// Returns why there is none, for people: nothing damps the tissue, or its points have no anchors.
     pub fn rest_s(&self, part: f64) -> Result<f64, &'static str> {
         if self.damping_n_s_per_m <= 0.0 {
             return Err("never: there is no damping");
@@ -60,8 +60,9 @@ impl Relaxation {
     }
 
     /// Returns l/h = √(k/K), at least 1: the length, in distances between neighbours h, over which a displacement falls
-    /// by e beside a disc, for springs of stiffness k = `spring_n_per_m`, N/m. There a membrane of springs and its
-    /// foundation are in balance, k·h²·u″ = K·u. Infinite if nothing pulls the tissue back.
+    /// by a factor of e beside a disc, for springs of stiffness k = `spring_n_per_m`, N/m. There a membrane of springs and its
+    /// foundation are in balance, k·h²·u″ = K·u. Infinite if nothing pulls the tissue back;
+    /// 1 if there are no springs either.
     pub fn reach(&self, spring_n_per_m: f64) -> f64 {
         (spring_n_per_m / self.restoring_n_per_m).sqrt().max(1.0)
     }

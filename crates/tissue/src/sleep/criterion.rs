@@ -1,5 +1,5 @@
-//! The physics of sleep: when tiles may sleep, and when changes of the tools' forces wake them. `tiles` keeps
-//! the sets.
+//! The physics of sleep: when tiles may sleep, when forces, grasped points and pressure wake them, and the energies of
+//! sleeping tiles. `tiles` keeps the sets.
 
 use crate::body::tables::SweepTables;
 use crate::guard::survey::{Forces, Survey, Write, energy_of};
@@ -32,8 +32,8 @@ pub(crate) fn wake_pushed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, app
 }
 
 /// Wakes tiles around grasped points that tools move by more than `far` spacings until the fraction `end` of step
-/// `step`. The points beside a sleeping tile are compared only between substeps (`tiles`): a scheme of several sweeps
-/// would pull at it where the tool was before.
+/// `step`. Sleeping tiles compare their neighbours only between substeps (`tiles`). Without this, later sweeps of the
+/// substep would use the tool's old position.
 pub(crate) fn wake_moved<T: Real>(
     context: &mut StepContext<'_, T>,
     prescribed: &Prescribed,
@@ -65,7 +65,7 @@ pub(crate) fn add_sleeping<T: Real>(
     let mut region = tiles.no_region();
     for (tile, known) in tiles.sleeping() {
         let [spring_j, anchor_j] = known.unwrap_or_else(|| {
-            // With the pressure under which the tile rests, which does not change while it sleeps.
+            // With the pressure at which the tile fell asleep, which it rests under.
             tables.apply_volume_pressure(tiles.volume_change_then(tile));
             tiles.cover(&mut region, std::iter::once(tile));
             let survey = Survey::of(tables, &plan.scheme, state, forces, &region);
@@ -82,8 +82,8 @@ pub(crate) fn add_sleeping<T: Real>(
 ///
 /// There is one pressure for the whole mesh. A tile falls asleep in balance with the pressure of that moment. It wakes
 /// when the pressure has changed so much since then that one of its points would move by more than it may (`tiles`), as
-/// for a change of the tools' force. Until it wakes, its contribution to the volume stays the same, so that its own
-/// omitted movement, which would change the pressure back a little, is within the same bound.
+/// for a change of the tools' force. Until it wakes, its contribution to the volume stays the same. Its own
+/// omitted movement would change the pressure back a little; that error is within the same bound.
 pub(crate) fn wake_pressed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, volume_change: f64, far: f64) {
     let Some(volume) = model.places.volume() else { return };
     let stiffness = model.scene.volume_stiffness_pa * volume.stretch_m;

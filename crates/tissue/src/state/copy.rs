@@ -1,5 +1,5 @@
-//! Copies of a tissue: of one moment, which another thread reads in slices while the tissue continues; for a snapshot; and
-//! twins that repeat steps for an audit.
+//! Copies of a tissue: for reading in another thread while the tissue continues, for a snapshot, and twins that repeat steps
+//! for an audit.
 //!
 //! Copying reads and writes each field once, which is the memory traffic of one substep, and only copies what
 //! has ever moved. So it happens at once, between two steps. Slow results are computed from the copy: forces
@@ -25,7 +25,7 @@ use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 
-/// Points times substeps in a slice of an audit, which takes some milliseconds.
+/// Size of a slice of an audit, in points times substeps; a slice takes a few milliseconds.
 const SLICE: u64 = 1 << 20;
 
 impl<T: Real> TissueState<T> {
@@ -123,7 +123,7 @@ impl<T: Real> TissueState<T> {
         sheet
     }
 
-    /// Returns the tissue under `model`, if that is in f64 and this one is not.
+    /// Returns the tissue converted to f64 and to `model`; `None` unless `model` is in f64 and this tissue is not.
     pub(super) fn in_f64(&self, model: &Arc<Model>) -> Option<Box<TissueState<f64>>> {
         if self.model.precision == Precision::F64 || model.precision != Precision::F64 {
             return None;

@@ -1,4 +1,4 @@
-//! What changes the state of a tissue besides a step: inputs of tools, checks of the guard and what follows from them,
+//! Changes to the state of a tissue other than a step: inputs of tools, checks of the guard and what follows from them,
 //! other models, and recovery.
 //!
 //! A change of model happens between two steps: springs, anchor springs and damping become those of another model.
@@ -11,7 +11,7 @@
 //! The guard leaves the tissue in the state of its last checkpoint, with the last substep that it tried. A
 //! recovery keeps that state, restores the model's own substep and releases all tools. Time does not go back:
 //! the tissue continues at the step at which the blow-up was found. Only displacements and velocities are kept;
-//! the scheme's history begins anew, as after a change of tissue (`change`). So the result depends on the
+//! the scheme's history begins anew, as after a change of model. So the result depends on the
 //! checkpoint alone.
 //!
 //! A checkpoint just after a change of tissue or a recovery has passed no check: the fault may be in that very
@@ -35,6 +35,7 @@ use crate::model::Model;
 use crate::scene::Precision;
 use crate::scene::profile::Motion;
 use crate::select::audit_window::{AuditWindow, Mark, SharedCheckpoint, WindowInputs};
+use crate::state::stage_times::StepStage;
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
@@ -109,8 +110,8 @@ impl<T: Real> TissueState<T> {
         Ok(())
     }
 
-    /// Returns the part of the work done that belongs to the next interval: half of the last increment's
-    /// (`central`), J.
+    /// Returns the part of the work done that belongs to the next interval: half of the work of the last
+    /// increment (`scheme::central`), J.
     pub(super) fn present_work_j(&self, survey: &Survey) -> f64 {
         if self.plan.scheme.takes_means() { 0.5 * survey.power * self.plan.unit_of_work_j(&self.model) } else { 0.0 }
     }
@@ -241,7 +242,7 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Continues a repetition, if there is one, by at least one step and until `may_go_on` returns false. It
-    /// ends when the checks pass up to where it began, or fail with the shortest substep. Returns whether it
+    /// ends when the checks pass up to the step at which the failure was found, or fail with the shortest substep. Returns whether it
     /// has ended.
     pub(super) fn go_on_repeating(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp> {
         let Some(mut repetition) = self.repetition.take() else { return Ok(true) };
@@ -256,6 +257,7 @@ impl<T: Real> TissueState<T> {
                 self.input(*tool, input.clone());
             }
             repetition.next_input += now;
+            self.ended(StepStage::Guard);
             self.do_step();
             if let Err(cause) = self.check() {
                 self.repeat_shorter(&mut repetition, cause)?;

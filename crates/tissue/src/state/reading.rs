@@ -62,8 +62,8 @@ impl<T: Real> PointReader<'_, T> {
         PointState { displacement_m, velocity_m_per_s, spring_n, anchor_n, damping_n, applied_n, constraint_n }
     }
 
-    /// Returns the force on a free point but for tips and inertia, N: that of springs, anchor springs, damping and
-    /// force-controlled tools.
+    /// Returns the force on a free point except that of tips and inertia, N: that of springs, anchor springs, damping and
+    /// force-controlled tools; before the first step without the latter.
     pub(super) fn force_on_free_n(&self, index: usize, mass: f64) -> DVec3 {
         let scene = &self.model.scene;
         let of_stiffness = self.model.relative_anchor_stiffness_at(index);

@@ -1,5 +1,4 @@
-//! Saves the whole state of a tissue for a snapshot, and restores a tissue from it that continues with the same
-//! bits.
+//! Saves the whole state of a tissue for a snapshot, and restores a tissue that continues bit for bit.
 //!
 //! Saving only copies memory, as a copy for readers does (`copy`). Restoring trusts nothing: it checks lengths,
 //! indices, numbers and their consistency, and rebuilds all tables.
@@ -33,7 +32,7 @@ use palpate_refusal::{Reason, Refusal, Result};
 
 /// Restores a tissue under its model, from its parts and the bytes of the values at its points
 /// ([`PlainTissue`]). The next steps give the same bits as those of the tissue that was saved. `model` must be the one
-/// of the parts, such as [`Model::resumed`] rebuilds it; `limits` are those of forces and tools.
+/// of the parts, as rebuilt by [`Model::resumed`]; `limits` are those of forces and tools.
 ///
 /// # Errors
 /// Refuses a tissue of another model (other points, number format, scheme, substeps, coefficients or fingerprint:
@@ -230,7 +229,7 @@ fn restored_as<T: Real>(
     ensure(values.len().is_multiple_of(size), "part of a value")?;
     let mut values = values.chunks_exact(size).map(T::read);
     let moved: Vec<usize> = parts.tiles.moved.iter().map(|tile| *tile as usize).collect();
-    // Far beyond what the guard allows a point in an interval. The guard finds an impossible state at the
+    // This bound is far beyond what the guard allows a point in an interval. The guard finds an impossible state at the
     // next step.
     let most = T::of(T::LARGEST);
     let mut fill = |state: &mut State<T>| -> Result<bool> {

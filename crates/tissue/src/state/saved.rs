@@ -1,17 +1,17 @@
 //! A saved tissue as plain data: the content of a snapshot, in a form that is independent of the program's own
 //! types.
 //!
-//! Each type that has a part of the state converts itself to these types and back, next to its private fields:
+//! Each type that has a part of the state converts itself to these types and back, in its own module:
 //! `applied_force`, `prescribed`, `contact`, `tiles`. `restore` combines them. A change of any type here
-//! changes the format of snapshots (`session::saved`).
+//! changes the format of snapshots (`session::snapshot`).
 //!
 //! **What is saved** is everything that the next steps depend on, and nothing that follows from it. Tables (of
 //! falloffs, discs, strips of a sweep) are rebuilt. The large part, the values at the points, is separate from
-//! these types, as little-endian bytes: only tiles that have ever moved have values, in the order of memory.
-//! That order is the same on every machine; the padding of rows is left out.
+//! these types, as little-endian bytes: only tiles that have ever moved have values, tile by tile, then field by
+//! field and row by row. That order is the same on every machine; the padding of rows is left out.
 //!
 //! **Memory of lists**: the sender of a snapshot decides how long its lists are. Optional parts of an entry are
-//! boxed, so that no entry takes many times its bytes in memory (`session::saved::memory_of`).
+//! boxed, so that no entry takes many times its bytes in memory (`session::snapshot::memory_of`).
 
 use std::fmt;
 use std::sync::Arc;

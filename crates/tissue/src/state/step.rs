@@ -135,7 +135,7 @@ impl<T: Real> TissueState<T> {
         self.ended(StepStage::Grasp);
     }
 
-    /// Solves the contact of position-controlled tools.
+    /// Lets position-controlled tools act (`tools::position_control`), each by the contact that `tools::contact` solves.
     fn touch(&mut self, substep: Substep) {
         let (mut context, _, contacts) = self.parts();
         contacts.act(&mut context, substep.end, substep.far);

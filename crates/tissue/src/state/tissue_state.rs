@@ -57,7 +57,7 @@ pub(crate) struct TissueState<T: Real> {
     pub(super) contacts: Contacts,
     pub(super) steps: u64,
     pub(super) work: Work,
-    /// `None` means the present state. A tissue at rest needs no copy.
+    /// `None`: the present state itself is the checkpoint, as in a tissue at rest.
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
     pub(super) inputs: Vec<(u64, usize, Input)>,

@@ -1,4 +1,4 @@
-//! Position-controlled tools: how they act in a substep, and the forces on them.
+//! Position-controlled tools: how they act in a substep, and the forces on them. `contact` solves the contact of one tool.
 
 use glam::DVec3;
 
