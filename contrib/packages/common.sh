@@ -31,6 +31,13 @@ skip() { say "not made: $*"; exit 3; }
 need_file() { [ -e "$1" ] || skip "$1 is missing: $2"; }
 need_tool() { command -v "$1" >/dev/null || skip "$1 is missing: $2"; }
 
+# What a package for an engine needs.
+need_engine_parts() {
+    [ "$(uname -s) $machine" = 'Linux x86_64' ] || skip 'it has the library for Linux on x86_64 alone'
+    need_tool "$python" 'apt-get install python3'
+    need_file "$built/deps/libpalpate_c.so" 'make build'
+}
+
 # Copies a program or library without its symbols, if strip is installed: binary FROM TO
 binary() {
     install -m 755 "$1" "$2"

@@ -4,9 +4,7 @@
 set -eu
 . "$(dirname "$0")/common.sh"
 
-[ "$(uname -s) $machine" = 'Linux x86_64' ] || skip 'the package has the library for Linux on x86_64 alone'
-need_tool "$python" 'apt-get install python3'
-need_file "$built/deps/libpalpate_c.so" 'make build'
+need_engine_parts
 folder=$work/package
 cp -r clients/csharp/unity "$folder"
 cp clients/csharp/Palpate.cs "$folder/Runtime/"

@@ -9,7 +9,7 @@
 //! - [`devices`]: devices of several makers, loaded at run time, and the placement of their workspace over the
 //!   tissue.
 //! - [`snapshot`]: receives snapshots of sessions; [`upload`]: sends meshes and journals.
-//! - [`shown`]: the surface of a session as an engine shows it: positions, normals, triangles.
+//! - [`surface_view`]: the surface of a session as an engine shows it: positions, normals, triangles.
 //! - [`os`]: what depends on the operating system.
 //! - [`watch`]: the samples of a session, without a tool.
 //! - [`view`]: the frames of a session: how its surface moves.

@@ -15,7 +15,6 @@ use palpate_session::Sample;
 use palpate_session::budget::{Account, Work};
 use palpate_session::local_model::StiffnessJob;
 use palpate_session::recovery::describe;
-use palpate_session::run::stage_times;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::surface::{MESH_ROW, Snapshot};
 use palpate_tissue::Hashing;
@@ -142,8 +141,8 @@ impl SessionTask {
             (status.recovery_count, status.recoveries) = (recovery_count, self.session.recoveries().list());
         }
         status.awake_points = self.session.tissue().awake_points();
-        if let Some(profile) = self.session.tissue().stage_times() {
-            status.stages = stage_times(profile);
+        if let Some(times) = self.session.tissue().stage_times() {
+            status.stages = times.list();
         }
         status.path_counts = path_counts;
         status.lapsed_leases = self.lapsed_leases;

@@ -8,9 +8,9 @@ use super::simulation::{Simulation, SimulationFailure};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
-use palpate_tissue::scene::record::{Line, Record, Run, StageTime, Summary, far_warning, write_line};
+use palpate_tissue::scene::record::{Line, Record, Run, Summary, far_warning, write_line};
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::{Model, StageTimes, StepStage, Tissue};
+use palpate_tissue::{Model, StageTimes, Tissue};
 
 /// Returns the first line of a run: the names of scene and script, the stepping of the model (integrator, substeps
 /// per step, precision, steps per second), and the version of this program.
@@ -215,16 +215,9 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         largest_displacement_m: 0.0,
         peak_reaction_n: 0.0,
         curves: Curves::default(),
-        stages: tissue.stage_times().map(stage_times).unwrap_or_default(),
+        stages: tissue.stage_times().map(StageTimes::list).unwrap_or_default(),
         network: None,
     }
-}
-
-/// Returns the time of each stage of a profile, in the order of a step.
-pub fn stage_times(profile: &StageTimes) -> Vec<StageTime> {
-    #[allow(clippy::cast_precision_loss)]
-    let time_s = |stage| profile.stage_ns(stage) as f64 * 1e-9;
-    StepStage::NAMES.iter().map(|(stage, name)| StageTime { stage: name, time_s: time_s(*stage) }).collect()
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::model::{Model, Plan};
-use crate::guard::work::CheckFailure;
+use crate::guard::work_account::CheckFailure;
 use crate::kernel::field::BLOCK;
 use crate::scene::profile::Poke;
 use crate::select::audit_window::{Mark, WindowInputs};

@@ -28,12 +28,12 @@ mod tools;
 
 pub use body::footprint::{Footprint, RestSurface, WeightedNode};
 pub use compile::check_processor;
-pub use guard::work::CheckFailure;
+pub use guard::work_account::CheckFailure;
 pub use interface::{BlowUp, Energy, Hashing, PointState, ReadCopy, Released, Tissue};
 pub use model::{Model, Plan};
 pub use scheme::order;
 pub use state::restore::restored;
-pub use state::stage_times::{StageTimes, StepStage};
+pub use state::stage_times::StageTimes;
 pub use state::tissue_state::at_rest;
 pub use tools::applied_force::Push;
 pub use tools::contact::{TangentInput, ToolContact};

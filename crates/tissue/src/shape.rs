@@ -120,6 +120,24 @@ impl fmt::Display for Extent {
     }
 }
 
+/// A place in a cell of a grid ([`RestShape::cell_around`]).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GridCell {
+    /// The corners, by index along x, then along y; at the end of a side of one point two are the same.
+    pub corners: [[PointId; 2]; 2],
+    /// The place between the corners along x and along y, 0 to 1.
+    pub part: [f64; 2],
+}
+
+impl GridCell {
+    /// Returns the value at the place, bilinear between those of the corners.
+    pub fn interpolate(&self, value: impl Fn(PointId) -> DVec3) -> DVec3 {
+        let along_y = |[from, to]: [PointId; 2]| value(from).lerp(value(to), self.part[1]);
+        let [from, to] = self.corners.map(along_y);
+        from.lerp(to, self.part[0])
+    }
+}
+
 /// The deepest place of a tip's path ([`RestShape::deepest`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Deepest {
@@ -209,14 +227,6 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         Err(Refusal::new(Reason::WrongKind, field, message))
     }
 
-    /// Returns the key that names a point in scripts and messages, `"point"` or `"vertex"`.
-    fn point_key(&self) -> &'static str {
-        match self.name(PointId(0)) {
-            PointName::Point(_) => "point",
-            PointName::Vertex(_) => "vertex",
-        }
-    }
-
     /// Returns the points along x and y, if the points are a grid numbered row by row (index i·ny + j).
     fn grid(&self) -> Option<[usize; 2]> {
         None
@@ -244,10 +254,10 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         self.rest_m(self.nearest(place_m))
     }
 
-    /// Returns the value of the surface at a place, m, from the values of points: that of the nearest point, or one
-    /// interpolated between the points around the place.
-    fn interpolate(&self, place_m: DVec3, value: &dyn Fn(PointId) -> DVec3) -> DVec3 {
-        value(self.nearest(place_m))
+    /// Returns the cell of four points around a place, m, if the points are a grid; a place beyond the rim is moved to
+    /// it. `None` if the nearest point stands for the place.
+    fn cell_around(&self, _place_m: DVec3) -> Option<GridCell> {
+        None
     }
 
     /// Returns the deepest place of the path of a tip of `radius_m` (m) along `way_m` (m) in the tissue at rest; `None`

@@ -18,7 +18,7 @@ mod member;
 mod migrate;
 mod owned;
 mod peers;
-mod positioned;
+mod positional_io;
 mod receive;
 mod reconcile;
 mod replica;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use super::positioned::write_all_at;
+use super::positional_io::write_all_at;
 use palpate_proto::pb;
 
 use palpate_realtime::clock::now_ns;

@@ -17,7 +17,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tracing::{info, warn};
 
 use super::peers::why;
-use super::positioned::read_exact_at;
+use super::positional_io::read_exact_at;
 use super::{Fleet, Standby};
 use crate::server::journals::progress::Grown;
 use palpate_cluster::{placement, rules};

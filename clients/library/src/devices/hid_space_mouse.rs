@@ -4,6 +4,7 @@ use std::io;
 use std::time::Instant;
 
 use glam::DVec3;
+use hidapi::{DeviceInfo, HidApi, HidDevice, HidError};
 use palpate_haptics::Device;
 use palpate_haptics::device::UNDECLARED;
 
@@ -13,13 +14,18 @@ use crate::device::{HapticDevice, Reading};
 
 /// An open SpaceMouse.
 pub(super) struct SpaceMouse {
-    device: hidapi::HidDevice,
+    device: HidDevice,
     reported: Reported,
     control: VelocityControl,
 }
 
-fn failed(error: hidapi::HidError) -> io::Error {
+fn failed(error: HidError) -> io::Error {
     io::Error::other(error.to_string())
+}
+
+/// Returns the devices that are connected.
+fn connected(api: &HidApi) -> impl Iterator<Item = &DeviceInfo> {
+    api.device_list().filter(|found| is_space_mouse(found.vendor_id(), found.product_string().unwrap_or("")))
 }
 
 impl SpaceMouse {
@@ -28,10 +34,8 @@ impl SpaceMouse {
     /// # Errors
     /// Returns an error if there is no such device, or if it can't be opened.
     pub(super) fn open(which: Option<&str>) -> io::Result<Self> {
-        let api = hidapi::HidApi::new().map_err(failed)?;
-        let mut devices =
-            api.device_list().filter(|found| is_space_mouse(found.vendor_id(), found.product_string().unwrap_or("")));
-        let found = devices.find(|found| which.is_none_or(|which| found.path().to_string_lossy() == which));
+        let api = HidApi::new().map_err(failed)?;
+        let found = connected(&api).find(|found| which.is_none_or(|which| found.path().to_string_lossy() == which));
         let none = || io::Error::new(io::ErrorKind::NotFound, "no such spacemouse is connected");
         let device = found.ok_or_else(none)?.open_device(&api).map_err(failed)?;
         device.set_blocking_mode(false).map_err(failed)?;
@@ -73,13 +77,11 @@ impl HapticDevice for SpaceMouse {
 /// Returns the devices: their names for [`super::open`], whether they are there, and a description.
 pub(super) fn list() -> Vec<(String, bool, String)> {
     let none = |about: String| vec![("spacemouse".to_owned(), false, about)];
-    let api = match hidapi::HidApi::new() {
+    let api = match HidApi::new() {
         Ok(api) => api,
         Err(error) => return none(error.to_string()),
     };
-    let found: Vec<_> = api
-        .device_list()
-        .filter(|found| is_space_mouse(found.vendor_id(), found.product_string().unwrap_or("")))
+    let found: Vec<_> = connected(&api)
         .map(|found| {
             let name = format!("spacemouse:{}", found.path().to_string_lossy());
             (name, true, found.product_string().unwrap_or("without a name").to_owned())

@@ -1,7 +1,7 @@
 //! Devices of several makers, found and loaded at run time: building this library needs no maker's SDK.
 //!
 //! [`open`] opens a device by its name, for [`crate::bridge::run`]. [`list`] returns the devices that are there, and
-//! [`check`] measures the timing of one. [`Placed`] places the workspace of any device over the tissue.
+//! [`check()`] measures the timing of one. [`Placed`] places the workspace of any device over the tissue.
 //!
 //! | name | what it is | how it is reached |
 //! |---|---|---|

@@ -83,13 +83,9 @@ fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
         let message = "does not go with `position.point`: a tool grasps a point of a sheet or a vertex of a mesh";
         return Err(Refusal::new(Reason::WrongKind, "position.vertex", message));
     }
-    let key = match (point, vertex) {
-        (Some(_), _) => "point",
-        (None, Some(_)) => "vertex",
-        (None, None) => shape.point_key(),
-    };
-    let field = format!("position.{key}");
-    shape.find(&field, required(&field, from_point(point, vertex))?)
+    let is_vertex = vertex.is_some() || point.is_none() && shape.grid().is_none();
+    let field = if is_vertex { "position.vertex" } else { "position.point" };
+    shape.find(field, required(field, from_point(point, vertex))?)
 }
 
 /// Returns the position of a pose's tip, m: the position plus the turned offset of the tip.

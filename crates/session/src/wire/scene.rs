@@ -260,10 +260,7 @@ pub fn sent(scene: &Scene) -> pb::Scene {
 /// Returns a scene as a message, with all defaults filled in and the coefficients that follow from a material. The
 /// mesh's vertices and ID and the appearance are left out.
 pub fn scene(scene: &Scene) -> pb::Scene {
-    let of_mesh = match &scene.body {
-        Body::Mesh(mesh) => Some(mesh),
-        Body::Sheet(_) => None,
-    };
+    let of_mesh = scene.mesh();
     pb::Scene {
         name: scene.name.clone(),
         sheet: scene.sheet().map(sheet),

@@ -36,7 +36,7 @@ impl<T: Real> Elastic<T> {
     /// Returns the force of all springs, of the extra anchor stiffness and of the pressure on a point, divided
     /// by its relative mass. For a few single points. `volume_change` is the growth of the volume.
     pub(crate) fn gather(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
-        lanes::single(&Gathering { springs: self, layout, u, volume_change, point }).unwrap_or_default()
+        lanes::single(&Gathering { springs: self, layout, u, volume_change, point })
     }
 
     /// Returns what [`Elastic::gather`] does, within [`lanes::single`].

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::guard::work::Work;
+use crate::guard::work_account::WorkAccount;
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::model::Model;
@@ -50,7 +50,7 @@ pub(crate) struct Checkpoint<T: Real> {
     pub(crate) applied: Applied<T>,
     pub(crate) prescribed: Prescribed,
     pub(crate) contacts: Contacts,
-    pub(crate) work: Work,
+    pub(crate) work: WorkAccount,
     /// The recent largest displacement, spacings. Sleep is relative to it.
     pub(crate) largest: f64,
     /// Whether the motion that led here has passed the checks, under the present springs.

@@ -13,13 +13,13 @@
 pub(crate) mod checkpoint;
 pub(crate) mod survey;
 pub(crate) mod tool_bounds;
-pub(crate) mod work;
+pub(crate) mod work_account;
 
 use std::sync::Arc;
 
 use super::model::{Model, Plan};
 use crate::body::tables::Elastic;
-pub use crate::guard::work::{CheckFailure, MARGIN};
+pub use crate::guard::work_account::{CheckFailure, MARGIN};
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
 use crate::memory;

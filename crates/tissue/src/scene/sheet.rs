@@ -11,7 +11,7 @@ use crate::scene::action_check::physical;
 use crate::scene::body::BodyKind;
 use crate::scene::springs::Springs;
 use crate::scene::toml_document::{Fields, Item};
-use crate::shape::{Deepest, Extent, PointId, PointName, RestShape};
+use crate::shape::{Deepest, Extent, GridCell, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};
 
 mod representative;
@@ -390,19 +390,16 @@ impl RestShape for Sheet {
         representative::of(self, radius_m, noticed_m, place_m.truncate()).extend(0.0)
     }
 
-    /// Interpolates bilinearly between the four points around a place; a place beyond the rim has the value of the
-    /// rim.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn interpolate(&self, place_m: DVec3, value: &dyn Fn(PointId) -> DVec3) -> DVec3 {
+    fn cell_around(&self, place_m: DVec3) -> Option<GridCell> {
         let along = |axis: usize| {
             let last = self.points[axis] - 1;
             let at = (place_m[axis] / self.spacing_m).clamp(0.0, last as f64);
             let from = (at as usize).min(last.saturating_sub(1));
-            (from, (from + 1).min(last), at - from as f64)
+            ([from, (from + 1).min(last)], at - from as f64)
         };
-        let ((i, above, s), (j, right, t)) = (along(0), along(1));
-        let at = |i: usize, j: usize| value(self.point([i, j]));
-        at(i, j).lerp(at(i, right), t).lerp(at(above, j).lerp(at(above, right), t), s)
+        let ((i, s), (j, t)) = (along(0), along(1));
+        Some(GridCell { corners: i.map(|i| j.map(|j| self.point([i, j]))), part: [s, t] })
     }
 
     /// Returns the lowest place over the sheet, and the middle of the sheet as the place that is pressed: the sheet is

@@ -11,7 +11,7 @@ use crate::scene::Precision;
 use crate::scheme::stability;
 use crate::scheme::{Oscillator, Relaxation};
 use crate::sleep::tiles::SleepTiles;
-use crate::state::context::StepContext;
+use crate::state::step_context::StepContext;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;

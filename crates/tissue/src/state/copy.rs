@@ -11,7 +11,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::guard::checkpoint::Checkpoint;
-use crate::guard::work::Work;
+use crate::guard::work_account::WorkAccount;
 use crate::interface::{ReadCopy, Tissue};
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
@@ -29,23 +29,28 @@ use crate::tools::contact::Contacts;
 const SLICE: u64 = 1 << 20;
 
 impl<T: Real> TissueState<T> {
+    /// Returns a copy of the values at all points. Only what has ever moved is copied.
+    fn copied_state(&self) -> State<T> {
+        let mut copy = State::zero(&self.tables.layout, self.state.kept.len());
+        copy.fields_mut().zip(self.state.fields()).for_each(|(to, from)| self.tiles.copy_moved(to, from));
+        copy
+    }
+
     /// Returns a copy whose points and hash are those of this tissue. It can't be stepped or surveyed: it has
     /// no tables of fixed points and forces.
     pub(super) fn read_copy(&self) -> ReadCopy {
-        let TissueState { model, plan, tables, state, tiles, .. } = self;
-        let mut state_copy = State::zero(&tables.layout, state.kept.len());
-        state_copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
+        let TissueState { model, plan, tables, tiles, .. } = self;
         ReadCopy::of(Box::new(TissueState {
             model: model.clone(),
             plan: plan.clone(),
             halvings: self.halvings,
             tables: tables.for_copy(),
-            state: state_copy,
+            state: self.copied_state(),
             applied: Applied::<T>::like(&self.applied),
             prescribed: self.prescribed.clone(),
             contacts: Contacts::default(),
             steps: self.steps,
-            work: Work::default(),
+            work: WorkAccount::default(),
             checkpoint: None,
             inputs: Vec::new(),
             repetition: None,
@@ -63,15 +68,13 @@ impl<T: Real> TissueState<T> {
     /// Returns a copy of everything that the next steps depend on. It shares the checkpoint, so that the next
     /// checkpoint takes new memory.
     pub(super) fn saved(&self) -> SavedTissue {
-        let TissueState { model, tables, state, tiles, .. } = self;
-        let mut state_copy = State::zero(&tables.layout, state.kept.len());
-        state_copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
+        let TissueState { model, tables, tiles, .. } = self;
         SavedTissue(Arc::new(TypedState {
             model: model.clone(),
             layout: tables.layout,
             steps: self.steps,
             halvings: self.halvings,
-            state: state_copy,
+            state: self.copied_state(),
             forces: self.applied.saved(),
             prescribed: self.prescribed.saved(),
             contacts: self.contacts.saved(),

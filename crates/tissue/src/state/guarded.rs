@@ -23,7 +23,7 @@ use crate::body::tables::springs_of;
 use crate::guard::checkpoint::{Checkpoint, Input, Repetition};
 use crate::guard::survey::{Forces, Survey, Write};
 use crate::guard::tool_bounds::broken_by_tools;
-use crate::guard::work::{Noise, Work};
+use crate::guard::work_account::{Noise, WorkAccount};
 use crate::guard::{
     CheckFailure, INTERVAL_SUBSTEPS, MAX_HALVINGS, MAX_INPUTS, MAX_PREDICTION_ERROR, NOISE, ROUNDING, broken_point,
     convert, farthest_in_spacings,
@@ -129,7 +129,7 @@ impl<T: Real> TissueState<T> {
             state.part_history(|to, from| tiles.copy_moved(to, from));
             let state = State::zero(&tables.layout, state.kept.len());
             let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
-            let (work, largest) = (Work::default(), 0.0);
+            let (work, largest) = (WorkAccount::default(), 0.0);
             let (steps, halvings, passed_checks) = (0, 0, true);
             Arc::new(Checkpoint { steps, halvings, state, applied, prescribed, contacts, work, largest, passed_checks })
         });
@@ -325,7 +325,7 @@ impl<T: Real> TissueState<T> {
         self.tables.is_settled(0.0);
         self.tables.take_work();
         let (survey, _, energy_j) = self.survey(&self.tiles.region);
-        self.work = Work::begun(
+        self.work = WorkAccount::begun(
             energy_j + self.contacts.coupling_j(&self.model, &self.tables.layout, &self.state),
             self.present_work_j(&survey),
         );

@@ -9,7 +9,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::tables::springs_of;
 use crate::guard::checkpoint::{Checkpoint, Input};
-use crate::guard::work::Work;
+use crate::guard::work_account::WorkAccount;
 use crate::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
@@ -125,7 +125,7 @@ pub(super) struct TypedState<T: Real> {
     pub(super) forces: SavedForces,
     pub(super) prescribed: SavedPrescribed,
     pub(super) contacts: Vec<SavedContact>,
-    pub(super) work: Work,
+    pub(super) work: WorkAccount,
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     pub(super) inputs: Vec<(u64, usize, Input)>,
     pub(super) tiles: TakenTiles<T>,
@@ -222,7 +222,7 @@ fn restored_as<T: Real>(
     sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
     sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
     sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
-    sheet.work = Work::restored(&parts.work)?;
+    sheet.work = WorkAccount::restored(&parts.work)?;
     sheet.tiles.restore(&parts.tiles)?;
 
     let size = size_of::<T>();
@@ -296,7 +296,7 @@ fn checkpoint_of<T: Real>(
         applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
         prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
         contacts: Contacts::restored(&saved.contacts, model, checks)?,
-        work: Work::restored(&saved.work)?,
+        work: WorkAccount::restored(&saved.work)?,
         largest: saved.largest,
         passed_checks: saved.passed_checks,
     })

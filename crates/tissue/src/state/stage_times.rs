@@ -1,8 +1,10 @@
 //! How long each stage of a step takes. The clock is an argument; without one, a stage costs a comparison.
 
+use crate::scene::record::StageTime;
+
 /// A stage of a step, in the order in which a step does them; waking and sleeping count as one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum StepStage {
+pub(crate) enum StepStage {
     /// Decides which tiles wake and which sleep.
     Sleep,
     /// Computes the pressure of an enclosed volume.
@@ -20,8 +22,8 @@ pub enum StepStage {
 }
 
 impl StepStage {
-    /// All stages, with their names as people read them.
-    pub const NAMES: [(StepStage, &'static str); 7] = [
+    /// All stages, with their names in records.
+    const NAMES: [(StepStage, &'static str); 7] = [
         (StepStage::Sleep, "sleep"),
         (StepStage::Pressure, "pressure"),
         (StepStage::Force, "force"),
@@ -32,8 +34,8 @@ impl StepStage {
     ];
 }
 
-/// The time that each stage of a tissue's steps has taken since the profile began
-/// ([`Tissue::profile`](crate::Tissue::profile)).
+/// The time that each stage of a tissue's steps has taken, since it is measured
+/// ([`Tissue::time_stages`](crate::Tissue::time_stages)).
 #[derive(Debug, Clone)]
 pub struct StageTimes {
     /// A clock that never goes back, ns.
@@ -59,13 +61,10 @@ impl StageTimes {
         self.last_ns = now_ns;
     }
 
-    /// Returns the time of a stage, ns, summed over all steps since the profile began.
-    pub fn stage_ns(&self, stage: StepStage) -> u64 {
-        self.stages_ns[stage as usize]
-    }
-
-    /// Returns the time of all stages together, ns.
-    pub fn total_ns(&self) -> u64 {
-        self.stages_ns.iter().sum()
+    /// Returns the time of each stage, in the order of a step.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn list(&self) -> Vec<StageTime> {
+        let time_s = |stage| self.stages_ns[stage as usize] as f64 * 1e-9;
+        StepStage::NAMES.iter().map(|(stage, name)| StageTime { stage: name, time_s: time_s(*stage) }).collect()
     }
 }

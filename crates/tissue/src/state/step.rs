@@ -7,8 +7,8 @@ use crate::scheme::each;
 use crate::scheme::family::Family;
 use crate::sleep::criterion::{put_to_sleep, wake_moved, wake_pressed, wake_pushed};
 use crate::sleep::tiles::CHECK_STEPS;
-use crate::state::context::StepContext;
 use crate::state::stage_times::StepStage;
+use crate::state::step_context::StepContext;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;
@@ -166,7 +166,7 @@ impl<T: Real> TissueState<T> {
         (StepContext { model, plan, tables, state, applied, tiles, work }, prescribed, contacts)
     }
 
-    /// Ends a stage of the profile, if there is one.
+    /// Ends a stage, if stages are timed.
     pub(super) fn ended(&mut self, stage: StepStage) {
         if let Some(times) = &mut self.stage_times {
             times.end(stage);

@@ -1,6 +1,6 @@
 //! A tissue in motion: its state, and what can be read from it. `step` advances it, `guarded` changes it otherwise.
 
-use std::cell::Cell;
+use std::cell::{Cell, LazyCell};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use crate::body::tables::{SweepTables, springs_of};
 use crate::body::window::Window;
 use crate::guard::checkpoint::{Checkpoint, Input, Repetition};
 use crate::guard::survey::{Forces, Survey, energy_of, pressure_j};
-use crate::guard::work::Work;
+use crate::guard::work_account::WorkAccount;
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::real::Real;
@@ -26,11 +26,11 @@ use crate::select::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::shape::PointId;
 use crate::sleep::criterion::add_sleeping;
 use crate::sleep::tiles::SleepTiles;
-use crate::state::reading::PointReader;
+use crate::state::point_reader::PointReader;
 use crate::state::saved::SavedTissue;
 use crate::state::stage_times::{StageTimes, StepStage};
 use crate::tools::applied_force::{Applied, Push, Term};
-use crate::tools::contact::{Contacts, TangentInput, Tool, ToolContact, displacement_m};
+use crate::tools::contact::{Contacts, TangentInput, ToolContact, displacement_m};
 use crate::tools::prescribed::{Grasp, Prescribed};
 use palpate_haptics::{ContactState, Tip};
 
@@ -56,7 +56,7 @@ pub(crate) struct TissueState<T: Real> {
     pub(super) prescribed: Prescribed,
     pub(super) contacts: Contacts,
     pub(super) steps: u64,
-    pub(super) work: Work,
+    pub(super) work: WorkAccount,
     /// `None`: the present state itself is the checkpoint, as in a tissue at rest.
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
@@ -87,7 +87,7 @@ impl<T: Real> TissueState<T> {
             tables: SweepTables::new(model, layout, springs_of(model, &plan)),
             state: State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated)),
             steps: 0,
-            work: Work::default(),
+            work: WorkAccount::default(),
             checkpoint: None,
             applied: Applied::new(),
             prescribed: Prescribed::new(),
@@ -133,9 +133,9 @@ impl<T: Real> TissueState<T> {
         self.substeps_done += steps * u64::from(self.plan.substeps);
     }
 
-    /// Returns the place of the displaced surface under a tool, m.
-    fn surface_m(&self, tool: &Tool) -> DVec3 {
-        tool.footprint.surface(|point| displacement_m(&self.model, &self.tables.layout, &self.state, point)).0
+    /// Returns the displacement of the point at a row and column of memory, m; of a multistep scheme the predicted one.
+    fn displacement_m(&self, point: [usize; 2]) -> DVec3 {
+        displacement_m(&self.model, &self.tables.layout, &self.state, point)
     }
 
     /// Returns a reader of points.
@@ -178,7 +178,7 @@ impl<T: Real> TissueState<T> {
         let (mut energy, kept_j) = energy_of(model, plan, &survey);
         energy.spring_j += pressure_j;
         // A grasped point moves with its tool, not as the scheme would move it.
-        let reader = self.reader();
+        let reader = LazyCell::new(|| self.reader());
         let own = self.prescribed.grasped().map(|(index, motion)| {
             let free = reader.free_velocity_m_per_s(index);
             model.relative_mass_at(index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
@@ -228,9 +228,13 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn tool_contact(&self, tool: usize) -> Option<ToolContact> {
         self.keep_growth();
-        let (tool, reader) = (self.contacts.tool(tool)?, self.reader());
-        let without_inertia = || tool.without_inertia(&self.model, |index, mass| reader.force_on_free_n(index, mass));
-        Some(tool.contact(self.surface_m(tool), without_inertia))
+        let tool = self.contacts.tool(tool)?;
+        let without_inertia = || {
+            let reader = self.reader();
+            tool.without_inertia(&self.model, |index, mass| reader.force_on_free_n(index, mass))
+        };
+        let (surface_m, _) = tool.footprint.surface(|point| self.displacement_m(point));
+        Some(tool.contact(surface_m, without_inertia))
     }
 
     fn tangent_input(&self, tool: usize) -> Option<TangentInput> {
@@ -238,9 +242,8 @@ impl<T: Real> Tissue for TissueState<T> {
         let window = Window::around(&self.model, &tool.footprint);
         // Without memory for it, the stiffness from the force law must suffice.
         memory::check(window.bytes(), "the stiffness under a tool").ok()?;
-        let displacement =
-            |index: usize| displacement_m(&self.model, &self.tables.layout, &self.state, self.model.point_of(index));
-        let displacement_m = window.points(&self.model).map(displacement).collect();
+        let displacement_m = |place: usize| self.displacement_m(self.model.point_of(place));
+        let displacement_m = window.points(&self.model).map(displacement_m).collect();
         Some(TangentInput { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
     }
 
@@ -287,11 +290,9 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn surface_displacement_m(&self, place_m: DVec3) -> DVec3 {
-        let displacement_m = |point| {
-            let place = self.model.point_of(self.model.place_of(point));
-            displacement_m(&self.model, &self.tables.layout, &self.state, place)
-        };
-        self.model.shape().interpolate(place_m, &displacement_m)
+        let shape = self.model.shape();
+        let Some(cell) = shape.cell_around(place_m) else { return self.point(shape.nearest(place_m)).displacement_m };
+        cell.interpolate(|point| self.displacement_m(self.model.point_of(self.model.place_of(point))))
     }
 
     fn reaction_around_n(&self, poke: &Poke) -> DVec3 {
@@ -428,6 +429,25 @@ mod tests {
             moved += usize::from(displacement_m.length() > 1e-6);
         }
         assert!(moved > 20 && shown.iter().all(|axis| axis.len() == model.len()), "{moved}");
+    }
+
+    #[test]
+    fn at_a_place_of_a_mesh_the_surface_moves_as_its_nearest_point_is_observed() {
+        let model = Model::gallbladder(&["stepping.precision=f64", "stepping.integrator=exponential3"]);
+        let mut tissue = TissueState::<f64>::new(&model);
+        let point = model.shape().nearest(DVec3::new(0.02, 0.0, -0.05));
+        let centre_m = model.shape().rest_m(point);
+        let force_n = DVec3::new(0.0, 0.01, 0.02);
+        let poke = Poke { point: None, centre_m, force_n, falloff_per_m: 200.0, falloff_offset: 0.0 };
+        tissue.push(0, Some(Push::Constant(poke)));
+        for _ in 0..5 {
+            tissue.step().unwrap();
+        }
+        let observed_m = tissue.point(point).displacement_m;
+        assert_eq!(tissue.surface_displacement_m(centre_m), observed_m);
+        // While it moves, a multistep scheme has predicted another place.
+        let predicted_m = tissue.displacement_m(model.point_of(model.place_of(point)));
+        assert!(observed_m != predicted_m && observed_m.length() > 1e-6, "{observed_m} {predicted_m}");
     }
 
     #[test]

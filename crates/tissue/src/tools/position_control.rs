@@ -9,7 +9,7 @@ use crate::body::tables::SweepTables;
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
 use crate::model::{Model, Plan};
-use crate::state::context::StepContext;
+use crate::state::step_context::StepContext;
 use crate::tools::contact::{ContactForce, Contacts, Tool, ToolContact, displacement_m, movement_m, push, within_cone};
 use palpate_haptics::Coupling;
 

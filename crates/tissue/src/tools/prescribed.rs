@@ -7,11 +7,11 @@ use crate::model::Model;
 use crate::scene::action_check::check_free;
 use crate::scene::profile::{Moment, Motion, MotionProfile};
 use crate::scheme::family::Release;
-use crate::state::context::StepContext;
 use crate::state::saved::{
     Checks, SavedGrasp, SavedGrasped, SavedPrescribed, Vector, ensure, restored_motion, restored_moves, saved_motion,
     saved_moves,
 };
+use crate::state::step_context::StepContext;
 use palpate_refusal::Result;
 
 /// How a tool moves its grasped point ([`Tissue::grasp`](crate::Tissue::grasp)). It lasts until the next input of the

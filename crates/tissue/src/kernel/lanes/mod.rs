@@ -331,24 +331,24 @@ pub(crate) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
 
 /// Work on single numbers. Mark [`SingleWork::compute`] and what it calls `#[inline(always)]`.
 pub(crate) trait SingleWork {
-    type Output;
+    type Output: Default;
     fn compute(&self) -> Self::Output;
 }
 
 /// Does `work` with fused multiply-add as an instruction. Elsewhere each such operation calls the C library, which takes
 /// longer, and on Windows (MinGW) rounds twice: then the bits differ.
-pub(crate) fn single<W: SingleWork>(work: &W) -> Option<W::Output> {
-    struct Single<'w, W: SingleWork>(&'w W, Cell<Option<W::Output>>);
+pub(crate) fn single<W: SingleWork>(work: &W) -> W::Output {
+    struct Single<'w, W: SingleWork>(&'w W, Cell<W::Output>);
     impl<W: SingleWork> Run<f64> for Single<'_, W> {
         #[inline(always)]
         unsafe fn run<V: Vector<Real = f64>>(&self) {
-            self.1.set(Some(self.0.compute()));
+            self.1.set(self.0.compute());
         }
     }
-    let single = Single(work, Cell::new(None));
+    let single = Single(work, Cell::default());
     // SAFETY: the program has no pointers.
     unsafe { run(Width(Lanes::Plain), &single) };
-    single.1.take()
+    single.1.into_inner()
 }
 
 /// The operations that registers of every kind have under the same name.

@@ -1,7 +1,7 @@
 //! What the stages of a step read and change.
 
 use crate::body::tables::SweepTables;
-use crate::guard::work::Work;
+use crate::guard::work_account::WorkAccount;
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::model::{Model, Plan};
@@ -17,5 +17,5 @@ pub(crate) struct StepContext<'a, T: Real> {
     /// The forces of force-controlled tools, which do work along the movements of other tools.
     pub(crate) applied: &'a Applied<T>,
     pub(crate) tiles: &'a mut SleepTiles<T>,
-    pub(crate) work: &'a mut Work,
+    pub(crate) work: &'a mut WorkAccount,
 }

@@ -63,7 +63,7 @@ pub(crate) struct Noise {
 
 /// The account of the tools' work, J, and of energies at the last survey.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct Work {
+pub(crate) struct WorkAccount {
     /// Work since the last survey, plus what its `present_j` subtracted.
     pub(crate) done_j: f64,
     /// Energy at the last survey.
@@ -74,14 +74,14 @@ pub(crate) struct Work {
     excess_j: f64,
 }
 
-impl Work {
+impl WorkAccount {
     /// Adds work.
     pub(crate) fn add(&mut self, work_j: f64) {
         self.done_j += work_j;
     }
 
     pub(crate) fn saved(&self) -> SavedWork {
-        let Work { done_j, energy_j, largest_j, excess_j } = *self;
+        let WorkAccount { done_j, energy_j, largest_j, excess_j } = *self;
         SavedWork { done_j, energy_j, largest_j, excess_j }
     }
 
@@ -89,12 +89,12 @@ impl Work {
         let SavedWork { done_j, energy_j, largest_j, excess_j } = *saved;
         let is_finite = [done_j, energy_j, largest_j, excess_j].iter().all(|energy_j| energy_j.is_finite());
         ensure(is_finite, "an energy that is not finite")?;
-        Ok(Work { done_j, energy_j, largest_j, excess_j })
+        Ok(WorkAccount { done_j, energy_j, largest_j, excess_j })
     }
 
     /// Creates an account that begins with the given energy.
     pub(crate) fn begun(energy_j: f64, present_j: f64) -> Self {
-        Work { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
+        WorkAccount { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
     }
 
     /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so far and
@@ -115,7 +115,7 @@ impl Work {
             return Err(CheckFailure::Energy { energy_j, before_j, work_j });
         }
         let largest_j = self.largest_j.max(energy_j);
-        *self = Work { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
+        *self = WorkAccount { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
         Ok(())
     }
 }
@@ -127,7 +127,7 @@ mod tests {
     #[test]
     fn energy_comes_from_work_alone() {
         const EXACT: Noise = Noise { part: 0.0, energy_j: 0.0 };
-        let begun = Work::begun(1.0, 0.0);
+        let begun = WorkAccount::begun(1.0, 0.0);
         // Up to the margin.
         assert_eq!({ begun }.survey(1.04, 0.0, EXACT, false), Ok(()));
         let found = CheckFailure::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
@@ -137,7 +137,7 @@ mod tests {
         // Work that belongs to the next interval does not count in this one.
         assert!({ worked }.survey(1.25, 0.2, EXACT, false).is_err());
         assert_eq!(worked.survey(1.2, 0.05, EXACT, false), Ok(()));
-        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2, excess_j: 0.0 });
+        assert_eq!(worked, WorkAccount { done_j: 0.05, energy_j: 1.2, largest_j: 1.2, excess_j: 0.0 });
         // A gain within the margin counts against the next while a tool touches, until it is lost again.
         let mut touched = begun;
         assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
@@ -147,8 +147,8 @@ mod tests {
         assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
         // Rounding noise does not count as energy.
         let rounding = Noise { energy_j: 1e-27, ..EXACT };
-        assert_eq!(Work::default().survey(1e-30, 0.0, rounding, true), Ok(()));
-        assert!(Work::default().survey(1e-24, 0.0, rounding, true).is_err());
+        assert_eq!(WorkAccount::default().survey(1e-30, 0.0, rounding, true), Ok(()));
+        assert!(WorkAccount::default().survey(1e-24, 0.0, rounding, true).is_err());
         // Losing energy is always allowed.
         assert_eq!(worked.survey(0.01, 0.0, EXACT, false), Ok(()));
     }

@@ -83,7 +83,7 @@ impl<T: Real> PointReader<'_, T> {
     /// Returns displacement, velocity and springs' force of a free point, under the applied force `applied_n`
     /// and that of tips.
     fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
-        lanes::single(&Observation { reader: self, index, applied_n }).unwrap_or_default()
+        lanes::single(&Observation { reader: self, index, applied_n })
     }
 }
 
