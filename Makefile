@@ -21,7 +21,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html 
 
 PACKAGES := deb wheel npm library image helm unity unreal
 
-.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs quick install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos site
 
@@ -102,9 +102,15 @@ need-node:
 build: need-rust
 	$(CARGO) build --release --workspace
 
-# The two programs alone: all that a poke needs. The libraries for C and Python take as long again.
+# The two programs alone. The libraries for C and Python take as long again.
+PROGRAMS := --package palpate --package palpate-programs
 programs: need-rust
-	$(CARGO) build --release --package palpate --package palpate-programs
+	$(CARGO) build --release $(PROGRAMS)
+
+# What `make run` starts: see the profile `quick` in Cargo.toml.
+quick: need-rust
+	$(CARGO) build --profile quick $(PROGRAMS)
+QUICK := $(or $(CARGO_TARGET_DIR),target)/quick
 
 # Below PREFIX: include, lib (with pkg-config and CMake), bin. As a package: DESTDIR=….
 PREFIX ?= /usr/local
@@ -152,14 +158,14 @@ page-if-node:
 # The server runs until Ctrl-C, which reaches it as well as this shell. The page is built beside the programs: each has
 # parts that keep one core busy alone.
 run:
-	@$(MAKE) --no-print-directory -j2 programs page-if-node
+	@$(MAKE) --no-print-directory -j2 quick page-if-node
 	@rm -f target/serving.txt; \
-	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
+	$(QUICK)/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
 	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
 	until grep -q http target/serving.txt; do kill -0 $$server 2>/dev/null || \
 		{ echo 'No server, so nothing to see. Another port: make run LISTEN=127.0.0.1:0' >&2; exit 1; }; sleep 0.05; done; \
 	url=$$(grep -o 'http.*' target/serving.txt); \
-	./target/release/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
+	$(QUICK)/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
 		|| { kill $$server; exit 1; }; \
 	echo; echo "The records are in target/poke.jsonl. Serving until Ctrl-C. To touch the tissue, open"; \
 	echo; echo "    $$url"; echo; \

@@ -119,7 +119,7 @@ fn main() {
             for id in batch {
                 poke(&mut haptics, id).await;
             }
-            // The tools are released when their leases lapse, if not before.
+            // The tools are released when their leases expire, if not before.
             if !settle(&mut sessions, batch).await {
                 return false;
             }

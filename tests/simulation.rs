@@ -68,7 +68,7 @@ struct ClientHistory {
     refused: BTreeMap<&'static str, u64>,
     seen: u64,
     dropped: u64,
-    lapsed: u64,
+    expired: u64,
 }
 
 fn poll<T>(reader: &mut Reader<T>) -> Option<(T, u64)> {
@@ -225,7 +225,7 @@ fn course(seed: u64) -> ClientHistory {
         }
     }
     found.accepted = intake.counts().accepted;
-    found.lapsed = intake.lapsed();
+    found.expired = intake.expired();
     found.hash = session.tissue().state_hash();
     found
 }
@@ -238,13 +238,13 @@ fn whatever_the_network_does_all_is_accounted_for_and_no_tool_stays_held() {
         all.accepted += found.accepted;
         all.seen += found.seen;
         all.dropped += found.dropped;
-        all.lapsed += found.lapsed;
+        all.expired += found.expired;
         for (reason, count) in found.refused {
             *all.refused.entry(reason).or_default() += count;
         }
     }
     // The courses have seen what they were made for.
-    assert!(all.accepted > 10_000 && all.seen > 10_000 && all.dropped > 0 && all.lapsed > 10, "{all:?}");
+    assert!(all.accepted > 10_000 && all.seen > 10_000 && all.dropped > 0 && all.expired > 10, "{all:?}");
     assert!(all.refused["TOOL_HELD"] > 10 && all.refused["NOT_HOLDER"] > 10, "{all:?}");
 }
 

@@ -16,7 +16,7 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
     let status = handle.status();
     let (held_tools, lapsed_leases, counts) = handle.at_intake(|intake, _| {
         let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
-        (held.collect(), intake.lapsed(), intake.counts())
+        (held.collect(), intake.expired(), intake.counts())
     });
     let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
     let model = &status.model;

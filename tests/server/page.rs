@@ -278,7 +278,7 @@ async fn a_tool_taken_over_grpc_web_is_not_held_for_long_by_who_says_nothing() {
     let session = server.paper(false).await;
     assert_eq!(acquire(&server, &session, 0, false), 0.2);
     assert_eq!(acquire(&server, &session, 1, true), 600.0);
-    let lapsed = tokio::time::timeout(TEST_TIMEOUT, async {
+    let expired = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let status = server.status(&session).await;
             if status.lapsed_leases == 1 {
@@ -287,6 +287,6 @@ async fn a_tool_taken_over_grpc_web_is_not_held_for_long_by_who_says_nothing() {
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
         }
     });
-    let held: Vec<u32> = lapsed.await.expect("the lease did not lapse").iter().map(|held| held.tool).collect();
+    let held: Vec<u32> = expired.await.expect("the lease did not expire").iter().map(|held| held.tool).collect();
     assert_eq!(held, [1]);
 }

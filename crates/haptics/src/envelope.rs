@@ -5,8 +5,7 @@
 //!    [`PAUSE_S`] the state is PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that
 //!    arrives earlier brings the force back within `RETURN_S`.
 //! 2. Soft engage. After `enable`, nothing is rendered until a model is known and its force is below
-//!    [`ENGAGE_BELOW_N`]. Then
-//!    the force ramps in over [`ENGAGE_S`].
+//!    [`ENGAGE_BELOW_N`]. Then the force ramps in over [`ENGAGE_S`].
 //! 3. The norm of the force (clamping its components would turn it), and the device's continuous force.
 //! 4. Passivity: no more energy leaves the port than has entered it.
 //! 5. Slew: the force changes by at most [`SLEW_N_PER_S`], up and down, in every state.
@@ -16,7 +15,9 @@
 //! Automation 18(1), 2002, doi:10.1109/70.988969). A force f along the hand's velocity v falls no faster than the
 //! slew S, so it still gives the energy f²·v/2S before it is zero. It is therefore limited to f ≤ √(2·S·E/v). This
 //! does not limit a spring K that is pressed in and released at v while its force falls no faster than the slew
-//! allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `MIN_SPEED_M_PER_S`. A device
+//! allows, K·v ≤ S. The hand may speed up meanwhile, and a turning force falls more slowly along its old direction, so
+//! v counts `SPEED_MARGIN` times. A hand at rest may start at any moment, so it counts as at least
+//! `MIN_SPEED_M_PER_S`. A device
 //! that nobody holds accelerates while the force falls: with an acceleration a, which falls with the force, it
 //! receives f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly accelerates within a few hundredths of a
 //! second, so this term hardly affects it. To allow a first force before any energy has entered, the energy tank
@@ -226,8 +227,8 @@ impl Envelope {
         (self.counts[reason as usize], self.ticks)
     }
 
-    /// Returns whether the ramp after `enable` has begun. It stays true until the next `enable`, or until the first
-    /// tick in another state than ENABLED.
+    /// Returns whether the ramp after `enable` has begun. It stays true until the first tick in another state than
+    /// ENABLED, or until an `enable` that changes the state.
     pub fn is_engaged(&self) -> bool {
         self.engaged_s.is_some()
     }
@@ -270,17 +271,19 @@ impl Envelope {
     /// Advances the envelope by one tick. Returns the force to render until the next tick, N: the wanted force after
     /// the limits at the top of this module, in their order. With a model of age a, the share that is left is 1 up to
     /// [`FRESH_S`], falls linearly to a half at [`STALE_S`], and is ½·e^{−(a − STALE_S)/DECAY_S} beyond. After
-    /// `enable` it rises as t/[`ENGAGE_S`], t from the beginning of the ramp. Passivity bounds the force by
-    /// √(2·S·E/v), with E the energy in the tank and v the hand's speed along the force (at least 0.08 m/s), and slew
-    /// bounds its change in a tick of length h (at most 10 ms count) by S·h, S = [`SLEW_N_PER_S`].
+    /// `enable` it rises as t/[`ENGAGE_S`], t from the beginning of the ramp. Passivity bounds the force f by
+    /// √(2·S·E/v), with E the energy in the tank and v = max(1.5·u, 0.08 m/s) + a·f/4S, where u is the hand's speed and
+    /// a its acceleration along the force; against a hand that presses on, `FIRST_N` is always allowed. Slew bounds
+    /// the change in a tick of length h (at most 10 ms count) by S·h, S = [`SLEW_N_PER_S`].
     ///
     /// A value that is not finite, or a place outside the workspace, changes the state to FAULT; a model or a gap
     /// between two ticks older than [`PAUSE_S`] changes it to PAUSED. The force then falls to zero within the slew.
     pub fn render(&mut self, wanted: &Wanted) -> DVec3 {
         self.ticks += 1;
-        let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
-        if !finite {
-            // The place of the device is unknown, so there is no work to account for. The force falls to zero.
+        let known = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
+        if !known || wanted.age_s.is_some_and(|age_s| !age_s.is_finite()) {
+            // The place of the device or the age of its model is unknown, so there is no work to account for. The force
+            // falls to zero.
             self.acted(LimitCause::NotFinite);
             self.fail();
             let step_n = SLEW_N_PER_S * NOMINAL_S;

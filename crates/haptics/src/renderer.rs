@@ -214,14 +214,14 @@ impl Renderer {
     }
 
     /// Receives a model that arrived at `now_s` by the clock of [`Renderer::tick`], s. It takes effect at the next
-    /// tick and replaces one that waits for it. A model whose sequence number is not above the last, or that is not
-    /// sound, is refused and counted ([`Renderer::refused`]). One that names an unknown law is rendered with the
-    /// oldest law.
+    /// tick and replaces one that waits for it. A model whose sequence number is not above the last, that is not
+    /// sound, or that arrives at a time that is not finite, is refused and counted ([`Renderer::refused`]). One that
+    /// names an unknown law is rendered with the oldest law.
     pub fn receive(&mut self, model: LocalModel, now_s: f64) {
         let arrived = self.arrived.as_ref().map(|arrived| &arrived.0);
         let newest = arrived.or(self.newest.as_ref().map(|newest| &newest.0));
         let late = newest.is_some_and(|newest| model.sequence <= newest.sequence);
-        if late || !model.is_sound() {
+        if late || !model.is_sound() || !now_s.is_finite() {
             self.refused += 1;
             return;
         }

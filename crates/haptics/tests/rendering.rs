@@ -149,8 +149,27 @@ fn models_that_are_broken_or_late_are_refused_and_counted() {
     renderer.receive(LocalModel { force_n: DVec3::splat(f64::NAN), ..newest }, now_s);
     renderer.receive(LocalModel { normal: DVec3::ZERO, ..newest }, now_s);
     renderer.receive(LocalModel { sequence: 3, force_n: 100.0 * DVec3::Z, ..newest }, now_s);
-    assert_eq!(renderer.refused(), 3);
+    renderer.receive(LocalModel { force_n: 100.0 * DVec3::Z, ..newest }, f64::NAN);
+    assert_eq!(renderer.refused(), 4);
     assert!((renderer.tick(now_s, place_m).z - 2.0).abs() < 1e-6);
+}
+
+#[test]
+fn an_age_that_is_not_finite_is_a_fault() {
+    for age_s in [f64::NAN, f64::INFINITY] {
+        let mut envelope = enabled(UNDECLARED);
+        let wanted = |now_s: f64, age_s: f64| Wanted {
+            now_s,
+            place_m: DVec3::ZERO,
+            velocity_m_per_s: DVec3::ZERO,
+            force_n: 0.1 * DVec3::Z,
+            age_s: Some(age_s),
+        };
+        envelope.render(&wanted(0.0, 0.0));
+        let force_n = envelope.render(&wanted(TICK_S, age_s));
+        assert!(force_n.is_finite() && envelope.state() == RenderingState::Fault, "{age_s}: {force_n}");
+        assert_eq!(envelope.count(LimitCause::NotFinite).0, 1);
+    }
 }
 
 #[test]

@@ -124,7 +124,7 @@ impl SessionHandle {
     pub fn at_intake<T>(&self, act: impl FnOnce(&mut Intake, u64) -> T) -> T {
         let mut intake = lock(&self.intake);
         let now = now_ns();
-        intake.lapse(now);
+        intake.release_expired(now);
         let answer = act(&mut intake, now);
         let wake = intake.take_wake();
         drop(intake);

@@ -208,7 +208,7 @@ impl SessionTask {
         {
             let mut intake = lock(&self.handle.intake);
             self.next_step = intake.rest(step, until, &self.schedule);
-            self.lapsed_leases = intake.lapsed();
+            self.lapsed_leases = intake.expired();
         }
         self.handle.cost.set_awake(self.running && self.next_step == step);
     }

@@ -72,7 +72,7 @@ impl Intake {
         now_ns: u64,
     ) -> Result<AcceptedBatch> {
         self.check_open()?;
-        self.lapse(now_ns);
+        self.release_expired(now_ns);
         if commands.is_empty() {
             self.renew(id, now_ns)?;
             return Ok(AcceptedBatch { id, commands: commands.into_iter() });

@@ -179,7 +179,7 @@ impl Intake {
     /// - [`Reason::ToolHeld`]: a lease, also this one, holds one of the tools.
     pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
         self.check_open()?;
-        self.lapse(now_ns);
+        self.release_expired(now_ns);
         self.leases.acquire(tools, holder, lease_s, id, now_ns, &self.rules.limits)?;
         tools.iter().for_each(|tool| self.take_tip(*tool));
         self.changed = true;
@@ -199,7 +199,7 @@ impl Intake {
     /// # Errors
     /// Refuses a lease that holds no tool: unknown, expired or released ([`Reason::NotHolder`]).
     pub fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
-        self.lapse(now_ns);
+        self.release_expired(now_ns);
         self.leases.renew(id, now_ns)
     }
 
@@ -228,7 +228,7 @@ impl Intake {
     /// Ends the leases that have expired at `now_ns`, ns, as [`Intake::release`] does, and frees some discarded
     /// commands. In a resting session it also advances the next step to that time, but never past a step for which
     /// something waits. Most functions with a `now_ns` call it.
-    pub fn lapse(&mut self, now_ns: u64) {
+    pub fn release_expired(&mut self, now_ns: u64) {
         if let Some((schedule, until)) = &self.resting {
             let until = self.first_waiting().map_or(*until, |step| step.min(*until));
             self.next_step = self.next_step.max(schedule.next_step(now_ns).min(until));
@@ -321,7 +321,7 @@ impl Intake {
         now_ns: u64,
     ) -> Result<Option<u64>> {
         self.check_open()?;
-        self.lapse(now_ns);
+        self.release_expired(now_ns);
         if self.changed_to.as_ref().map(Arc::as_ptr) != base.map(Arc::as_ptr) {
             return Ok(None);
         }
@@ -367,8 +367,8 @@ impl Intake {
     /// unless it is the very next one, `step`.
     pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
         let waiting = self.first_waiting();
-        let lapse = self.leases.first_expiry_ns().map(|ns| schedule.next_step(ns));
-        let next = [waiting, lapse].into_iter().flatten().fold(until, u64::min).max(step);
+        let expiry = self.leases.first_expiry_ns().map(|ns| schedule.next_step(ns));
+        let next = [waiting, expiry].into_iter().flatten().fold(until, u64::min).max(step);
         self.resting = (next > step).then_some((*schedule, next));
         self.next_step = self.next_step.max(step);
         (self.changed, self.woken) = (false, false);
@@ -392,7 +392,7 @@ impl Intake {
     /// step and then by arrival. Ends the leases that have expired at `now_ns`, ns, first, and a rest. Commands of a
     /// batch that is not wholly in the queue stay. Step `step` + 1 is the next one afterwards.
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
-        self.lapse(now_ns);
+        self.release_expired(now_ns);
         self.resting = None;
         let leases = &self.leases;
         let is_held_back = |key: &QueueKey, due: &Due| {
@@ -421,8 +421,8 @@ impl Intake {
     }
 
     /// Returns the number of tools so far whose lease expired; released ones do not count.
-    pub fn lapsed(&self) -> u64 {
-        self.leases.lapsed()
+    pub fn expired(&self) -> u64 {
+        self.leases.expired()
     }
 
     /// Returns the counts of the commands so far, by outcome. Commands of a batch that are not in the queue yet count

@@ -52,7 +52,7 @@ pub(super) type QueueKey = (u64, u64);
 #[derive(Debug, Default)]
 pub(super) struct Leases {
     held: BTreeMap<u32, LeasedTool>,
-    lapsed: u64,
+    expired: u64,
 }
 
 impl Leases {
@@ -163,7 +163,7 @@ impl Leases {
     pub(super) fn take_expired(&mut self, now_ns: u64) -> Option<u32> {
         let tool = self.held.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0)?;
         self.held.remove(&tool);
-        self.lapsed += 1;
+        self.expired += 1;
         Some(tool)
     }
 
@@ -178,8 +178,8 @@ impl Leases {
     }
 
     /// Returns the number of tools so far whose lease expired.
-    pub(super) fn lapsed(&self) -> u64 {
-        self.lapsed
+    pub(super) fn expired(&self) -> u64 {
+        self.expired
     }
 
     /// Returns the tools for which `chosen` holds, by number and by the account that is charged.

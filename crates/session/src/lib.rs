@@ -378,7 +378,7 @@ impl Session {
         for due in due.drain(..) {
             self.act(due);
         }
-        self.expire();
+        self.end_expired_actions();
         self.play();
         if self.step_count() == 0 {
             observe(self);
@@ -562,7 +562,7 @@ impl Session {
     }
 
     /// Ends the actions whose time to live is over.
-    fn expire(&mut self) {
+    fn end_expired_actions(&mut self) {
         let step = self.step_count();
         for index in 0..self.tools.len() {
             if self.tools[index].expires_at.is_some_and(|at| at <= step) {

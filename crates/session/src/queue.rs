@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use super::command::Due;
 use super::lease::QueueKey;
 
-/// WaitingCommands by their key: step, then order of arrival. A single one takes no memory of its own: at 1 kHz a command waits
-/// alone for the next step.
+/// Commands that wait, by their key: step, then order of arrival. A single one takes no memory of its own: at 1 kHz a
+/// command waits alone for the next step.
 #[derive(Debug, Default)]
 struct WaitingCommands {
     /// The only command; `None` if there are none or several.
@@ -56,8 +56,8 @@ impl WaitingCommands {
     }
 }
 
-/// WaitingCommands that no longer take effect, as [`Intake::close`](super::intake::Intake::close) returns them. Dropping
-/// this frees them, which takes time: do so without a lock.
+/// Commands that no longer take effect, as [`Intake::close`](super::intake::Intake::close) returns them. Dropping this
+/// frees them, which takes time: do so without a lock.
 #[derive(Debug, Default)]
 pub struct Discarded(Vec<WaitingCommands>);
 
@@ -71,16 +71,16 @@ impl Discarded {
 /// The queue of waiting commands and ends of leases.
 #[derive(Debug, Default)]
 pub(super) struct Queue {
-    /// WaitingCommands to the tools that are held.
+    /// Commands to the tools that are held.
     by_tool: BTreeMap<u32, WaitingCommands>,
     /// Ends of leases.
     endings: WaitingCommands,
-    /// WaitingCommands of leases that have ended, by tool. [`Queue::free_some`] frees them piece by piece.
+    /// Commands of leases that have ended, by tool. [`Queue::free_some`] frees them piece by piece.
     discarded: Vec<WaitingCommands>,
     /// Number of commands in `by_tool`, and of those in `discarded`.
     waiting: usize,
     left_over: usize,
-    /// WaitingCommands of all tools that are due, before they are sorted; kept for its buffer.
+    /// Commands of all tools that are due, before they are sorted; kept for its buffer.
     due: Vec<(QueueKey, Due)>,
 }
 

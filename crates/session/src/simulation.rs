@@ -33,7 +33,7 @@ pub enum SimulationFailure {
 }
 
 /// A session with its queue of inputs, which the caller steps without a server. Its tools are held by one lease of
-/// its own, which never lapses while times are 0.
+/// its own, which never expires while times are 0.
 pub struct Simulation {
     /// The tissue and its tools. If you advance it directly, inputs that wait for that step act later.
     pub session: Session,
@@ -137,8 +137,8 @@ impl Simulation {
     }
 
     /// Begins a step: queues the script's commands for it, changes the tissue to the last one that is due, if any,
-    /// and moves the commands that act at the coming step out of the queue. Ends the leases that have lapsed at
-    /// `now_ns`, ns of the caller's clock; with 0 no lease lapses. [`Simulation::step`] calls it.
+    /// and moves the commands that act at the coming step out of the queue. Ends the leases that have expired at
+    /// `now_ns`, ns of the caller's clock; with 0 no lease expires. [`Simulation::step`] calls it.
     ///
     /// # Errors
     /// Refuses a command of the script, for the reasons of [`Simulation::command`].
@@ -165,8 +165,8 @@ impl Simulation {
         self.changes.drain(..due).next_back().map(|change| change.1)
     }
 
-    /// Advances one step, with the inputs that act at its beginning. Leases that have lapsed at `now_ns`, ns, end;
-    /// with 0 none lapses. A session that has stopped does not advance, and this is no error
+    /// Advances one step, with the inputs that act at its beginning. Leases that have expired at `now_ns`, ns, end;
+    /// with 0 none expires. A session that has stopped does not advance, and this is no error
     /// ([`Session::hold_reason`]).
     ///
     /// # Errors

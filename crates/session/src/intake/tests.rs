@@ -60,15 +60,15 @@ fn stamps_mean_the_same_at_rest() {
 }
 
 #[test]
-fn a_lease_lapses_at_rest_and_what_is_wanted_earlier_comes_first() {
+fn a_lease_expires_at_rest_and_what_is_wanted_earlier_comes_first() {
     let (mut intake, schedule) = intake();
     assert_eq!(intake.rest(3, 50, &schedule), 50);
     // The clock is late: time stands at the step that is to be done.
-    intake.lapse(90 * MS);
+    intake.release_expired(90 * MS);
     assert_eq!(intake.next_step(), 50);
     assert_eq!(intake.rest(51, u64::MAX, &schedule), 1001);
-    intake.lapse(1000 * MS);
-    assert_eq!((intake.lapsed(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
+    intake.release_expired(1000 * MS);
+    assert_eq!((intake.expired(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
     // A session whose very next step is wanted does not rest.
     assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1001);
     assert!(!intake.is_resting());

@@ -1,5 +1,5 @@
-//! A scene describes the tissue, its springs, and how time advances. The server reads it from TOML (or from a
-//! protobuf message, in the crate `wire`), checks it, and never changes it afterwards.
+//! A scene describes the tissue, its springs, and how time advances. It is read from TOML here, or from a protobuf
+//! message by the session's module `wire`, and checked. A running tissue changes only the coefficients of its copy.
 
 pub mod action;
 pub mod action_check;
@@ -195,7 +195,7 @@ impl Appearance {
     }
 }
 
-/// Surfaces that the server can paint (`painted`: what a generated image shows.
+/// Surfaces that the server can paint: what a generated image shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PaintedSurface {
     /// The lining of a stomach.

@@ -242,15 +242,15 @@ mod tests {
 
     #[test]
     fn a_and_the_springs_stiffness_make_the_square_of_the_fastest_turn() {
-        let sheet = Oscillator {
+        let oscillator = Oscillator {
             mass_kg: 0.02,
             damping_n_s_per_m: 0.3,
             anchor_stiffness_n_per_m: 7.0,
             spring_stiffness_n_per_m: 130.0,
         };
         for substep_s in [1e-4, 1e-3, 0.02] {
-            let ((a, g), z) = (sheet.scaled(substep_s), sheet.scaled_spring_stiffness(substep_s));
-            let turn = sheet.omega_bound_per_s() * substep_s;
+            let ((a, g), z) = (oscillator.scaled(substep_s), oscillator.scaled_spring_stiffness(substep_s));
+            let turn = oscillator.omega_bound_per_s() * substep_s;
             assert!((a + z - turn * turn).abs() < 1e-12 * turn * turn);
             assert!((z / a - 130.0 / 7.0).abs() < 1e-12 && (g - 15.0 * substep_s).abs() < 1e-15);
         }

@@ -77,24 +77,24 @@ pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
 ///
 /// This is dt·ω_b ≤ 2, the bound of central differences: u₊ − (2 − W)·u + u₋ = 0 with W = (dt·ω)² has the
 /// solutions zⁿ with z² − (2 − W)·z + 1 = 0, and both are on the unit circle if |2 − W| ≤ 2.
-pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
-    substeps_of_turn(step_s, sheet.omega_bound_per_s(), 2.0)
+pub fn least_substeps(step_s: f64, oscillator: &Oscillator) -> u32 {
+    substeps_of_turn(step_s, oscillator.omega_bound_per_s(), 2.0)
 }
 
 /// Returns about the fewest substeps in a step of `step_s`, s, with which an integrator is stable
 /// ([`is_stable`]). It tries upwards from [`least_substeps`], an eighth more each time. It ends, even if the
 /// test never succeeds, where the fastest vibration turns by 0.1 rad in a substep and C·dt/m is at most 1:
 /// there every scheme is stable but for rounding. Saturates at `u32::MAX`.
-pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
-    let mut substeps = least_substeps(step_s, sheet);
+pub fn stable_substeps(integrator: Integrator, step_s: f64, oscillator: &Oscillator) -> u32 {
+    let mut substeps = least_substeps(step_s, oscillator);
     let stable = |substeps: u32| {
         let substep_s = step_s / f64::from(substeps);
-        let (a, g) = sheet.scaled(substep_s);
-        is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+        let (a, g) = oscillator.scaled(substep_s);
+        is_stable(&Scheme::fit(integrator, a, g), oscillator.scaled_spring_stiffness(substep_s))
     };
     // All schemes are stable up to dt·ω = 0.3 even without damping, and up to dt·C/m = 2 (`rk4` to 2.785);
     // because of rounding, the test may never succeed.
-    let fastest_per_s = (sheet.omega_bound_per_s() / 0.1).max(sheet.damping_n_s_per_m / sheet.mass_kg);
+    let fastest_per_s = (oscillator.omega_bound_per_s() / 0.1).max(oscillator.damping_n_s_per_m / oscillator.mass_kg);
     let most = (step_s * fastest_per_s).min(f64::from(u32::MAX));
     while !stable(substeps) && f64::from(substeps) < most {
         substeps = substeps.saturating_add(substeps / 8 + 1);
@@ -108,14 +108,14 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
 ///
 /// dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤ 1, half of its bound 2
 /// (W + 2g < 4 with W = 0). Saturates at `u32::MAX`.
-pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
-    let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
-    let omega = sheet.omega_bound_per_s();
+pub fn substeps(integrator: Integrator, step_s: f64, oscillator: &Oscillator) -> u32 {
+    let decay_s = 2.0 * oscillator.mass_kg / oscillator.damping_n_s_per_m;
+    let omega = oscillator.omega_bound_per_s();
     let turn = || substeps_of_turn(step_s, omega, THETA / endurance(omega, decay_s));
     // Half the stable damping, so that light points do not ring with the substep.
-    let lag = || substeps_of_turn(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
+    let lag = || substeps_of_turn(step_s, oscillator.damping_n_s_per_m / oscillator.mass_kg, 1.0);
     match entry(integrator).bound {
-        Bound::Stable => stable_substeps(integrator, step_s, sheet),
+        Bound::Stable => stable_substeps(integrator, step_s, oscillator),
         Bound::Turn => turn(),
         Bound::TurnAndLag => turn().max(lag()),
     }
@@ -176,7 +176,7 @@ mod tests {
         let omega_per_s = |stiffness: f64| (stiffness / 0.01_f64).sqrt();
         for spring_stiffness_n_per_m in [0.0, 10.0, 3e3, 4e5] {
             for damping_n_s_per_m in [0.0, 0.05, 8.0, 400.0] {
-                let sheet = Oscillator {
+                let oscillator = Oscillator {
                     mass_kg: 0.01,
                     damping_n_s_per_m,
                     anchor_stiffness_n_per_m: 5.0,
@@ -185,10 +185,10 @@ mod tests {
                 for integrator in all() {
                     let grows = |substeps: u32| {
                         let substep_s = 1e-3 / f64::from(substeps);
-                        let (a, g) = sheet.scaled(substep_s);
-                        !is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+                        let (a, g) = oscillator.scaled(substep_s);
+                        !is_stable(&Scheme::fit(integrator, a, g), oscillator.scaled_spring_stiffness(substep_s))
                     };
-                    let found = stable_substeps(integrator, 1e-3, &sheet);
+                    let found = stable_substeps(integrator, 1e-3, &oscillator);
                     let case = format!("{integrator:?} {spring_stiffness_n_per_m} {damping_n_s_per_m}: {found}");
                     let turn = omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3;
                     // Without damping some grow by less than rounding tells, however short the substep.
@@ -199,15 +199,18 @@ mod tests {
                     assert!(turn / f64::from(found) <= 2.0, "{case}");
                 }
                 let turn = |integrator| {
-                    let substeps = f64::from(substeps(integrator, 1e-3, &sheet));
+                    let substeps = f64::from(substeps(integrator, 1e-3, &oscillator));
                     omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3 / substeps
                 };
                 // Vibrations that last for 2m/C ask for a smaller turn of the yardsticks.
-                let most = THETA / endurance(sheet.omega_bound_per_s(), 0.02 / damping_n_s_per_m) * (1.0 + 1e-12);
+                let most = THETA / endurance(oscillator.omega_bound_per_s(), 0.02 / damping_n_s_per_m) * (1.0 + 1e-12);
                 assert!(turn(Integrator::Central) <= most && turn(Integrator::Lagged) <= most);
-                let lagged = substeps(Integrator::Lagged, 1e-3, &sheet);
+                let lagged = substeps(Integrator::Lagged, 1e-3, &oscillator);
                 assert!(damping_n_s_per_m / 0.01 * 1e-3 / f64::from(lagged) <= 1.0);
-                assert_eq!(substeps(Integrator::Rk4, 1e-3, &sheet), stable_substeps(Integrator::Rk4, 1e-3, &sheet));
+                assert_eq!(
+                    substeps(Integrator::Rk4, 1e-3, &oscillator),
+                    stable_substeps(Integrator::Rk4, 1e-3, &oscillator)
+                );
             }
         }
     }
@@ -233,17 +236,17 @@ mod tests {
 
     #[test]
     fn nothing_that_vibrates_needs_one_substep() {
-        let sheet = Oscillator {
+        let oscillator = Oscillator {
             mass_kg: 1.0,
             damping_n_s_per_m: 0.0,
             anchor_stiffness_n_per_m: 0.0,
             spring_stiffness_n_per_m: 0.0,
         };
         for integrator in all() {
-            assert_eq!(substeps(integrator, 1e-3, &sheet), 1, "{integrator:?}");
+            assert_eq!(substeps(integrator, 1e-3, &oscillator), 1, "{integrator:?}");
         }
         // An absurd one asks for as many as can be counted, at once.
-        let absurd = Oscillator { spring_stiffness_n_per_m: 1e40, ..sheet };
+        let absurd = Oscillator { spring_stiffness_n_per_m: 1e40, ..oscillator };
         assert_eq!(least_substeps(1e-3, &absurd), u32::MAX);
     }
 }

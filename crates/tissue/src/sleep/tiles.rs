@@ -8,13 +8,13 @@
 //! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when
 //! one of them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is
 //! ε, or less if springs are much stiffer than the anchor springs and so pass on more of an omitted force. A
-//! tile also wakes when the tools' force on it may have changed by more than ε_w·K″ since (`criterion`), or the
-//! pressure (`volume_change`), when one of its points is grasped (`tissue_state`), and when a
-//! position-controlled tool pushes on it (`position_control`). A point that moves by more than ε_w in one
+//! tile also wakes when the tools' force on it may have changed by more than ε_w·K″ since, or the pressure (both
+//! `criterion`), when one of its points is grasped (`state::guarded`), and when a position-controlled tool
+//! pushes on it (`position_control`). A point that moves by more than ε_w in one
 //! substep would escape that comparison if springs reach two rows, or a scheme has several sweeps: so it wakes
 //! all tiles that it reaches in the sweeps of a substep, whether a tool moves it (`criterion`,
-//! `position_control`) or it moves by itself. All tiles wake when the tissue changes (`change`), after a
-//! recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
+//! `position_control`) or it moves by itself. All tiles wake when the tissue changes, after a recovery, and when
+//! the guard goes back to a checkpoint (all `state::guarded`).
 //!
 //! **Cost.** The cost of a step depends on the awake part, not on the size of the tissue: sets of tiles are
 //! lists, memory in which nothing has ever moved is never written, a checkpoint copies what was awake since the

@@ -706,8 +706,9 @@ impl ContactForce {
     }
 }
 
-/// Returns a force on the tissue limited to the friction cone around −`normal`, preceded by whether it was
-/// already inside.
+/// Returns a force limited to the friction cone around the line of `normal`, a unit vector, preceded by whether it was
+/// already inside. The cone is double: a force that pulls has the friction of one that presses as hard, so callers
+/// first check the sign of its part along the normal.
 pub(crate) fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
     let pressing_n = force_n.dot(normal) * normal;
     let across_n = force_n - pressing_n;
