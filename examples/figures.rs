@@ -14,12 +14,12 @@ use glam::DVec3;
 use palpate::render::{Camera, Film, View};
 use palpate_session::Session;
 use palpate_session::surface::Refinement;
+use palpate_texture as texture;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::tangent;
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::scene::{BUILT_IN, PAPER, Scene};
-use palpate_tissue::texture;
 
 const SIZE: [usize; 2] = [560, 420];
 

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use palpate_refusal::Reason;
+use palpate_texture::{Image, image, painted, texture};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{Appearance, Named, PAPER, PaintedSurface, Scene};
-use palpate_tissue::texture::{Image, image, painted, texture};
 
 fn palpate(arguments: &[&str]) -> Output {
     let program = env!("CARGO_BIN_EXE_palpate");

@@ -14,11 +14,11 @@ use palpate_session::command::{Command, Due};
 use palpate_session::snapshot::{Saved, VERSION, seal};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::saved::SavedPlan;
 use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, MotionProfile, Move, Poke, Profile, StrengthProfile};
 use palpate_tissue::scene::record::{AuditedError, Correction};
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Change, Integrator, Lanes, Named, PAPER, Precision, Scene};
-use palpate_tissue::state::saved::SavedPlan;
 
 /// Little is rehearsed: most scenes give the number of substeps.
 fn limits() -> Limits {

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use palpate::render::{self, Film, View};
 use palpate_session::surface::Refinement;
+use palpate_texture as texture;
 use palpate_tissue::scene::collection::find_script;
-use palpate_tissue::texture;
 
 use super::scene::{SceneArguments, compile};
 use super::{Failure, say, with_progress, write_file};

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
+use palpate_texture as texture;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{Named, PaintedSurface};
-use palpate_tissue::texture;
 
 use super::{Failure, write_file};
 

@@ -3,7 +3,7 @@
 
 use glam::{DVec2, DVec3};
 
-use palpate_tissue::texture::Image;
+use palpate_texture::Image;
 
 /// Samples along each side of a pixel.
 pub(super) const SAMPLES: usize = 3;

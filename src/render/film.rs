@@ -7,11 +7,11 @@ use super::picture::{Arrow, View, picture};
 use palpate_session::Session;
 use palpate_session::simulation::{Simulation, SimulationFailure};
 use palpate_session::surface::{Skin, Snapshot};
+use palpate_texture::Image;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::texture::Image;
 
 /// A script that is played on a session of its own, step by step and only forwards, to make pictures of it.
 pub struct Film<'a> {

@@ -6,8 +6,8 @@ use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use super::surface::{DrawnSurface, Vertex};
 use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_session::surface::{Refinement, Skin as Shown, Snapshot};
+use palpate_texture::Image;
 use palpate_tissue::shape::{PointId, PointName, RestShape};
-use palpate_tissue::texture::Image;
 
 /// A camera that looks at the middle of the tissue at rest. Parsed from `AZIMUTH,ELEVATION` or
 /// `AZIMUTH,ELEVATION,DISTANCE`; only that checks the ranges. The default is `25,32,2`.

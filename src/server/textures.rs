@@ -14,11 +14,11 @@ use super::page;
 use palpate_realtime::Pacer;
 use palpate_refusal::Refusal;
 use palpate_session::budget::{Purpose, Resource, Taken};
+use palpate_texture::{Texture, texture};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::scene::Appearance;
-use palpate_tissue::texture::{Texture, texture};
 
 /// The account that textures are charged to. No caller pays for them: a kept texture serves later callers too.
 const ACCOUNT: &str = "textures";

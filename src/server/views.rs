@@ -21,7 +21,7 @@ use palpate_realtime::{FrameReader, StreamGuard, StreamKind};
 use palpate_refusal::number;
 use palpate_session::surface::Refinement;
 use palpate_session::wire;
-use palpate_tissue::texture::Texture;
+use palpate_texture::Texture;
 
 pub(super) struct Views(pub(super) Services);
 

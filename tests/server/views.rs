@@ -137,7 +137,7 @@ async fn a_texture_is_sent_once() {
     };
     let (png, etag) = sent(&session_id, "").await.unwrap();
     let limits = palpate_tissue::limits::Limits::default();
-    let standard = palpate_tissue::texture::texture(&palpate_tissue::scene::Appearance::default(), &limits).unwrap();
+    let standard = palpate_texture::texture(&palpate_tissue::scene::Appearance::default(), &limits).unwrap();
     assert!(png == standard.png && etag == standard.etag);
     assert_eq!(sent(&session_id, &etag).await.unwrap(), (Vec::new(), etag));
     let nobody: tonic::Status = sent("paper", "").await.unwrap_err();

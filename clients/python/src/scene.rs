@@ -7,11 +7,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use palpate_refusal::{Reason, Refusal};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::saved::SavedPlan;
 use palpate_tissue::scene::collection::{Collection, find_scene, find_script};
 use palpate_tissue::scene::kind::TextKind;
 use palpate_tissue::scene::{self, Named};
 use palpate_tissue::shape::{PointId, PointName};
-use palpate_tissue::state::saved::SavedPlan;
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyString};
 

@@ -156,7 +156,7 @@ mod tests {
     use super::*;
     use crate::Session;
     use crate::command::{Command, Due};
-    use palpate_tissue::guard::CheckFailure;
+    use palpate_tissue::CheckFailure;
     use palpate_tissue::scene::script::Action;
     use palpate_tissue::shape::{PointId, PointName};
     use palpate_tissue::{BlowUp, Model};

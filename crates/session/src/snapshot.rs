@@ -1,7 +1,7 @@
 //! Snapshots: a session at one moment, as bytes, from which it continues with the bits that it would have had
 //! without a stop.
 //!
-//! **Content**: the state of the tissue ([`tissue::state::saved`]), the state of each tool with its path, what
+//! **Content**: the state of the tissue ([`tissue::saved`]), the state of each tool with its path, what
 //! recoveries depend on, and counts. A snapshot has no waiting commands, no leases, no unfinished audit and no scene.
 //!
 //! **What a caller keeps beside it**: only the scene with which the session began. The snapshot has the result of
@@ -32,11 +32,11 @@ use super::{Posed, Session, Tool};
 use palpate_haptics::pose_playback::{Path, PathState};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::record::Recovery;
-use palpate_tissue::state::saved::{
+use palpate_tissue::saved::{
     Checks, PlainTissue, SNAPSHOT, SavedPlan, SavedPoke, SavedTip, SavedTissue, TissueParts, ensure, tool_above,
     unsound,
 };
+use palpate_tissue::scene::record::Recovery;
 use palpate_tissue::{self as tissue, Model, Tissue};
 
 /// The first eight bytes of a snapshot.

@@ -4,14 +4,14 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use super::model::{Model, Plan};
+use crate::body::model::{Model, Plan};
 use crate::kernel::lanes;
 use crate::limits::Limits;
 use crate::response::tangent;
+use crate::saved::{CorrectedPlan, SavedPlan};
 use crate::scene::{Change, Integrator, Named, Precision, Scene, Stepping};
 use crate::scheme::{Oscillator, entry};
 use crate::select::scheme_selection::{self, Choice};
-use crate::state::saved::{CorrectedPlan, SavedPlan};
 use palpate_refusal::{Reason, Refusal, Result, number, unsigned_zero};
 
 /// What sleeping tiles may add to the error by default, as a fraction of it.

@@ -1,19 +1,19 @@
 //! The trait of a tissue in motion, and the types of its methods.
 
+use std::fmt;
 use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
-use super::model::{Model, Plan};
-use crate::guard::work_account::CheckFailure;
+use crate::audit_window::{Mark, WindowInputs};
+use crate::body::model::{Model, Plan};
 use crate::kernel::field::BLOCK;
+use crate::saved::SavedTissue;
 use crate::scene::profile::Poke;
-use crate::select::audit_window::{Mark, WindowInputs};
-use crate::shape::PointId;
-use crate::state::saved::SavedTissue;
-use crate::state::stage_times::StageTimes;
+use crate::shape::{PointId, PointName};
+use crate::stage_times::StageTimes;
 use crate::tools::applied_force::Push;
 use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
@@ -59,6 +59,49 @@ pub struct Energy {
     pub spring_j: f64,
     /// Energy of the anchor springs, Σ ½K″·u².
     pub anchor_j: f64,
+}
+
+/// Reason why a check of the guard failed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CheckFailure {
+    /// A point is not finite, or is displaced by a billion times the tissue's size.
+    NotFinite {
+        /// One such point.
+        point: PointName,
+    },
+    /// The energy rose by more than the tools' work and the tolerance ([`MARGIN`](crate::guard::MARGIN)).
+    Energy {
+        /// Energy of springs, anchor springs and motion, J.
+        energy_j: f64,
+        /// That energy at the last survey, J.
+        before_j: f64,
+        /// Work of all tools since, J.
+        work_j: f64,
+    },
+    /// The springs' force is far from its prediction: by more than [`MAX_PREDICTION_ERROR`](crate::guard::MAX_PREDICTION_ERROR).
+    Prediction {
+        /// The resulting difference of a displacement, as a fraction of the largest displacement.
+        part: f64,
+    },
+}
+
+impl fmt::Display for CheckFailure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            CheckFailure::NotFinite { point } => {
+                write!(f, "point {point} was not finite (or a billion tissues away)")
+            }
+            CheckFailure::Energy { energy_j, before_j, work_j } => {
+                write!(
+                    f,
+                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
+                )
+            }
+            CheckFailure::Prediction { part } => {
+                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
+            }
+        }
+    }
 }
 
 /// An instability of the motion that the guard could not repair with shorter substeps. [`Tissue::step`] returns
@@ -169,7 +212,7 @@ pub trait Tissue: Send {
     /// [`Tissue::change`] applies.
     fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>>;
     /// Returns the present scheme and substep. The guard may have halved the substep of the model's plan up to
-    /// 4 times ([`MAX_HALVINGS`](crate::guard::MAX_HALVINGS)).
+    /// 4 times ([`MAX_HALVINGS`](crate::state::guard::MAX_HALVINGS)).
     fn plan(&self) -> &Plan;
     /// Returns how many times the guard went back to a checkpoint and repeated the steps since with a shorter
     /// substep, successfully. Several halvings for one fault count once; a blow-up does not count.

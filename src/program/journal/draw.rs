@@ -6,7 +6,7 @@ use palpate::render::{self, Arrow, Gif, Still, View};
 use palpate_session::Session;
 use palpate_session::journal::{Replay, ReplayEvent};
 use palpate_session::surface::{Refinement, Skin};
-use palpate_tissue::texture;
+use palpate_texture as texture;
 
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;

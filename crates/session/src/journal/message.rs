@@ -19,11 +19,11 @@ use crate::wire::scene::{from_scene, sent};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::saved::{CorrectedPlan, SavedPlan};
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Appearance, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
-use palpate_tissue::state::saved::{CorrectedPlan, SavedPlan};
 
 /// Least number of tools with which a journal is read, whatever the limits of this program are.
 const MAX_TOOLS: u32 = 4096;

@@ -15,11 +15,11 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::body::model::Model;
 use crate::body::sheet::footprint::GridDisc;
 use crate::body::surface::footprint::MeshDisc;
-use crate::model::Model;
+use crate::saved::{SavedGeometry, ensure, unsound};
 use crate::scene::Body;
-use crate::state::saved::{SavedGeometry, ensure, unsound};
 use palpate_refusal::Result;
 
 /// Smallest movement of a disc on a mesh, as a part of its radius. Computing its weights costs as much as

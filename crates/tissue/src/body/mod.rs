@@ -1,7 +1,10 @@
 //! The kinds of tissue, with one folder each: `sheet` and `surface` (meshes). Each has its layout, its sweep
 //! over the springs, and the contact of a disc with it.
 
+mod advance;
 pub(crate) mod footprint;
+pub(crate) mod force_field;
+pub mod model;
 pub(crate) mod sheet;
 pub mod surface;
 pub(crate) mod tables;

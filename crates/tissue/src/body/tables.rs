@@ -5,6 +5,9 @@ use std::cell::RefCell;
 use std::sync::Arc;
 
 use crate::body::Places;
+use crate::body::advance::AdvanceStage;
+use crate::body::force_field::{self, Pull, Term};
+use crate::body::model::{Model, Plan};
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
 use crate::body::surface::pressure::{Pressure, push_of};
@@ -15,10 +18,7 @@ use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::springs::{SpringCoefficients, Springs};
 use crate::kernel::stage::Stage;
-use crate::model::{Model, Plan};
-use crate::scheme::advance::AdvanceStage;
 use crate::scheme::arithmetic::{Arithmetic, MAX_KEPT};
-use crate::tools::applied_force::{self, Pull, Term};
 
 /// Number of tool forces that need no heap memory.
 const FEW: usize = 4;
@@ -211,7 +211,7 @@ impl<T: Real> SweepTables<T> {
             d: state.d.as_mut_ptr(),
             kept,
             pulls,
-            forced: applied_force::rows(terms),
+            forced: force_field::rows(terms),
             free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
             masses: self.masses_and_extra()[0],
             probe: self.probe.as_mut_ptr(),

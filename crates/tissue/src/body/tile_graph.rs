@@ -7,11 +7,11 @@ use std::sync::Arc;
 use super::Places;
 use super::sheet::tiles::{EdgeWatch, SheetTiles};
 use super::surface::MeshPlaces;
+use crate::body::force_field::ForceChange;
+use crate::body::model::Model;
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, tile_of};
-use crate::model::Model;
-use crate::tools::applied_force::ForceChange;
 
 /// The tiles of a tissue and what joins them.
 #[derive(Debug, Clone)]

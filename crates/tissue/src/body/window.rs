@@ -4,7 +4,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::body::Places;
 use crate::body::footprint::Footprint;
-use crate::model::Model;
+use crate::body::model::Model;
 use crate::scheme::Relaxation;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.

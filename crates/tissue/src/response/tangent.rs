@@ -21,9 +21,9 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::body::MemoryLayout;
 use crate::body::footprint::{Footprint, WeightedNode};
+use crate::body::model::Model;
 use crate::body::window::{Spring, Triple, Window};
 use crate::memory;
-use crate::model::Model;
 
 /// The accuracy of a solution: the bounds at which the solvers stop.
 #[derive(Debug, Clone, Copy, PartialEq)]

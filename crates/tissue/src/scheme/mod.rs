@@ -5,7 +5,6 @@
 //! the equation of motion are then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the
 //! springs and F from the tools. Small numbers stay small and keep their digits in f32.
 
-pub(crate) mod advance;
 pub(crate) mod arithmetic;
 mod central;
 mod exponential;

@@ -17,12 +17,12 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::model::Model;
+use crate::audit_window::Replay;
+pub use crate::audit_window::{Mark, SharedCheckpoint, WindowInputs};
+use crate::body::model::Model;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
 use crate::scheme::Relaxation;
-use crate::select::audit_window::Replay;
-pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
 
 /// How many substeps of the twin (the repetition in f64) usually replace one of the tissue: the argument
 /// `finer` of [`Audit::work`].

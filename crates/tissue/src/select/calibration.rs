@@ -15,8 +15,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use glam::DVec3;
 
+use crate::body::model::{Model, Plan};
 use crate::kernel::lanes;
-use crate::model::{Model, Plan};
 use crate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use crate::scene::{Integrator, Precision, Scene};
 use crate::scheme::Oscillator;

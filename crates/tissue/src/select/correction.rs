@@ -5,8 +5,8 @@
 
 use std::sync::Arc;
 
+use crate::body::model::Model;
 use crate::limits::Limits;
-use crate::model::Model;
 use crate::scene::record::Correction;
 use crate::scene::{Integrator, Precision, Stepping};
 use crate::scheme::entry;

@@ -1,7 +1,6 @@
 //! Chooses the scheme of a tissue: rehearsal, selection, audit, and correction.
 
 pub mod audit;
-pub(crate) mod audit_window;
 pub(crate) mod calibration;
 pub(crate) mod correction;
 pub mod scheme_selection;

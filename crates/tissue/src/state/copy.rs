@@ -10,17 +10,17 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::guard::checkpoint::Checkpoint;
-use crate::guard::work_account::WorkAccount;
+use crate::audit_window::{AuditWindow, Replay, Resume, WindowInputs};
+use crate::body::model::Model;
 use crate::interface::{ReadCopy, Tissue};
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::memory;
-use crate::model::Model;
+use crate::saved::SavedTissue;
 use crate::scene::Precision;
-use crate::select::audit_window::{AuditWindow, Replay, Resume, WindowInputs};
+use crate::state::guard::checkpoint::Checkpoint;
+use crate::state::guard::work_account::WorkAccount;
 use crate::state::restore::TypedState;
-use crate::state::saved::SavedTissue;
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;

@@ -19,26 +19,27 @@
 
 use std::sync::Arc;
 
+use crate::audit_window::{AuditWindow, Mark, SharedCheckpoint, WindowInputs};
+use crate::body::model::Model;
 use crate::body::tables::springs_of;
-use crate::guard::checkpoint::{Checkpoint, Input, Repetition};
-use crate::guard::survey::{Forces, Survey, Write};
-use crate::guard::tool_bounds::broken_by_tools;
-use crate::guard::work_account::{Noise, WorkAccount};
-use crate::guard::{
-    CheckFailure, INTERVAL_SUBSTEPS, MAX_HALVINGS, MAX_INPUTS, MAX_PREDICTION_ERROR, NOISE, ROUNDING, broken_point,
-    convert, farthest_in_spacings,
-};
-use crate::interface::{BlowUp, PointState, Released, Tissue};
+use crate::interface::{BlowUp, CheckFailure, PointState, Released, Tissue};
 use crate::kernel::field::{Field, State};
 use crate::kernel::real::Real;
-use crate::model::Model;
 use crate::scene::Precision;
 use crate::scene::profile::Motion;
-use crate::select::audit_window::{AuditWindow, Mark, SharedCheckpoint, WindowInputs};
-use crate::state::stage_times::StepStage;
+use crate::stage_times::StepStage;
+use crate::state::guard::checkpoint::{Checkpoint, Repetition};
+use crate::state::guard::survey::{Forces, Survey, Write};
+use crate::state::guard::tool_bounds::broken_by_tools;
+use crate::state::guard::work_account::{Noise, WorkAccount};
+use crate::state::guard::{
+    INTERVAL_SUBSTEPS, MAX_HALVINGS, MAX_INPUTS, MAX_PREDICTION_ERROR, NOISE, ROUNDING, broken_point, convert,
+    farthest_in_spacings,
+};
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
+use crate::tools::input::ToolInput;
 use crate::tools::prescribed::Prescribed;
 
 impl<T: Real> TissueState<T> {
@@ -187,7 +188,7 @@ impl<T: Real> TissueState<T> {
         (self.halvings, self.plan) = (halvings, plan);
     }
 
-    pub(super) fn input(&mut self, tool: usize, input: Input) {
+    pub(super) fn input(&mut self, tool: usize, input: ToolInput) {
         if self.checkpoint.is_none() {
             self.take_checkpoint();
         }
@@ -196,19 +197,19 @@ impl<T: Real> TissueState<T> {
         self.tell(tool, input);
     }
 
-    pub(super) fn tell(&mut self, tool: usize, input: Input) {
+    pub(super) fn tell(&mut self, tool: usize, input: ToolInput) {
         match input {
-            Input::Push(push) => {
+            ToolInput::Push(push) => {
                 self.prescribed.release(tool);
                 self.contacts.release(tool);
                 self.applied.set(tool, push);
             }
-            Input::Pose(place_m, tip) => {
+            ToolInput::Pose(place_m, tip) => {
                 self.prescribed.release(tool);
                 self.applied.set(tool, None);
                 self.contacts.pose(&self.model, tool, place_m, tip);
             }
-            Input::Grasp(index, grasp) => {
+            ToolInput::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
                 self.contacts.release(tool);
                 self.tiles.wake_under([self.model.point_of(index)]);
@@ -295,7 +296,7 @@ impl<T: Real> TissueState<T> {
         self.steps = step;
         self.begin_account();
         for tool in &tools {
-            self.input(*tool, Input::Push(None));
+            self.input(*tool, ToolInput::Push(None));
         }
         self.known_volume_change.set(None);
         Released { tools, at_rest }

@@ -1,11 +1,14 @@
-//! The state of a tissue: its step, its readings, what changes it otherwise, its copies, and how it is saved and restored.
+//! The state of a tissue: the stages of its step, its readings, what changes it otherwise, its copies, and how it is
+//! restored.
 
 mod copy;
+mod grasping;
+pub mod guard;
 mod guarded;
 mod point_reader;
+mod position_control;
 pub(crate) mod restore;
-pub mod saved;
-pub(crate) mod stage_times;
+pub(crate) mod sleep;
 mod step;
 pub(crate) mod step_context;
 #[cfg(test)]

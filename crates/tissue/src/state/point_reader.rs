@@ -2,16 +2,16 @@
 
 use glam::DVec3;
 
+use crate::body::model::{Model, Plan};
 use crate::body::tables::SweepTables;
 use crate::interface::PointState;
 use crate::kernel::field::State;
 use crate::kernel::lanes::{self, Scalar, SingleWork};
 use crate::kernel::real::Real;
-use crate::model::{Model, Plan};
 use crate::scene::profile::Moment;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::observer::Observer;
-use crate::sleep::tiles::SleepTiles;
+use crate::state::sleep::tiles::SleepTiles;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;

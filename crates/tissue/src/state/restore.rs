@@ -7,26 +7,27 @@ use std::sync::Arc;
 
 use xxhash_rust::xxh3::Xxh3;
 
+use crate::body::model::{Model, Plan};
 use crate::body::tables::springs_of;
-use crate::guard::checkpoint::{Checkpoint, Input};
-use crate::guard::work_account::WorkAccount;
-use crate::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
 use crate::limits::Limits;
 use crate::memory;
-use crate::model::{Model, Plan};
-use crate::scene::{Named, Precision};
-use crate::sleep::tiles::TakenTiles;
-use crate::state::saved::{
+use crate::saved::{
     Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedPrescribed, SavedState,
     TissueParts, ensure, unsound,
 };
+use crate::scene::{Named, Precision};
+use crate::state::guard::checkpoint::Checkpoint;
+use crate::state::guard::work_account::WorkAccount;
+use crate::state::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
+use crate::state::sleep::tiles::TakenTiles;
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
+use crate::tools::input::ToolInput;
 use crate::tools::prescribed::Prescribed;
 use palpate_refusal::{Reason, Refusal, Result};
 
@@ -127,7 +128,7 @@ pub(super) struct TypedState<T: Real> {
     pub(super) contacts: Vec<SavedContact>,
     pub(super) work: WorkAccount,
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
-    pub(super) inputs: Vec<(u64, usize, Input)>,
+    pub(super) inputs: Vec<(u64, usize, ToolInput)>,
     pub(super) tiles: TakenTiles<T>,
     pub(super) guard_events: u64,
     pub(super) substeps_done: u64,
@@ -265,7 +266,7 @@ fn restored_as<T: Real>(
     let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
     for (step, tool, input) in &parts.inputs {
         ensure((from..=sheet.steps).contains(step), "an input at a step before its checkpoint or after its end")?;
-        sheet.inputs.push((*step, checks.tool(*tool)?, Input::restored(input, model, &checks)?));
+        sheet.inputs.push((*step, checks.tool(*tool)?, ToolInput::restored(input, model, &checks)?));
     }
     ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;
     if sheet.checkpoint.is_none() {

@@ -5,9 +5,9 @@ use crate::scene::Precision;
 use crate::scene::profile::Moment;
 use crate::scheme::each;
 use crate::scheme::family::Family;
-use crate::sleep::criterion::{put_to_sleep, wake_moved, wake_pressed, wake_pushed};
-use crate::sleep::tiles::CHECK_STEPS;
-use crate::state::stage_times::StepStage;
+use crate::stage_times::StepStage;
+use crate::state::sleep::criterion::{put_to_sleep, wake_moved, wake_pressed, wake_pushed};
+use crate::state::sleep::tiles::CHECK_STEPS;
 use crate::state::step_context::StepContext;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::Contacts;
@@ -82,7 +82,7 @@ impl<T: Real> TissueState<T> {
     /// Lets released points go, sums the springs, and advances the points.
     fn sweep(&mut self, Substep { from, end, .. }: Substep) {
         let (context, prescribed, _) = self.parts();
-        let freed = prescribed.take_released(&context, from);
+        let freed = prescribed.take_freed(&context, from);
         // A scheme that takes means adds the change to the substep's increment; other schemes add it to the
         // initial state.
         let takes_means = self.plan.scheme.takes_means();

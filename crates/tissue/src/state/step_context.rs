@@ -1,11 +1,11 @@
 //! What the stages of a step read and change.
 
+use crate::body::model::{Model, Plan};
 use crate::body::tables::SweepTables;
-use crate::guard::work_account::WorkAccount;
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
-use crate::model::{Model, Plan};
-use crate::sleep::tiles::SleepTiles;
+use crate::state::guard::work_account::WorkAccount;
+use crate::state::sleep::tiles::SleepTiles;
 use crate::tools::applied_force::Applied;
 
 /// The parts of a tissue with which a stage works.

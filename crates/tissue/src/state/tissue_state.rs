@@ -7,30 +7,32 @@ use std::sync::Arc;
 use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
+use crate::audit_window::{AuditWindow, Mark, WindowInputs};
+use crate::body::force_field::Term;
+use crate::body::model::{Model, Plan};
 use crate::body::tables::{SweepTables, springs_of};
 use crate::body::window::Window;
-use crate::guard::checkpoint::{Checkpoint, Input, Repetition};
-use crate::guard::survey::{Forces, Survey, energy_of, pressure_j};
-use crate::guard::work_account::WorkAccount;
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::memory;
-use crate::model::{Model, Plan};
 use crate::response::around_place::reaction_around;
+use crate::saved::SavedTissue;
 use crate::scene::Precision;
 use crate::scene::profile::Poke;
 use crate::scheme::observer::Observer;
-use crate::select::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::shape::PointId;
-use crate::sleep::criterion::add_sleeping;
-use crate::sleep::tiles::SleepTiles;
+use crate::stage_times::{StageTimes, StepStage};
+use crate::state::guard::checkpoint::{Checkpoint, Repetition};
+use crate::state::guard::survey::{Forces, Survey, energy_of, pressure_j};
+use crate::state::guard::work_account::WorkAccount;
 use crate::state::point_reader::PointReader;
-use crate::state::saved::SavedTissue;
-use crate::state::stage_times::{StageTimes, StepStage};
-use crate::tools::applied_force::{Applied, Push, Term};
+use crate::state::sleep::criterion::add_sleeping;
+use crate::state::sleep::tiles::SleepTiles;
+use crate::tools::applied_force::{Applied, Push};
 use crate::tools::contact::{Contacts, TangentInput, ToolContact, displacement_m};
+use crate::tools::input::ToolInput;
 use crate::tools::prescribed::{Grasp, Prescribed};
 use palpate_haptics::{ContactState, Tip};
 
@@ -60,7 +62,7 @@ pub(crate) struct TissueState<T: Real> {
     /// `None`: the present state itself is the checkpoint, as in a tissue at rest.
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
-    pub(super) inputs: Vec<(u64, usize, Input)>,
+    pub(super) inputs: Vec<(u64, usize, ToolInput)>,
     /// A repetition by the guard; until it ends, the present step is unfinished.
     pub(super) repetition: Option<Repetition>,
     pub(super) audit_window: AuditWindow,
@@ -215,15 +217,15 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn push(&mut self, tool: usize, push: Option<Push>) {
-        self.input(tool, Input::Push(push));
+        self.input(tool, ToolInput::Push(push));
     }
 
     fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp) {
-        self.input(tool, Input::Grasp(self.model.place_of(point), grasp));
+        self.input(tool, ToolInput::Grasp(self.model.place_of(point), grasp));
     }
 
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
-        self.input(tool, Input::Pose(place_m, tip));
+        self.input(tool, ToolInput::Pose(place_m, tip));
     }
 
     fn tool_contact(&self, tool: usize) -> Option<ToolContact> {

@@ -52,12 +52,12 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::body::footprint::{Footprint, RestSurface, WeightedNode};
+use crate::body::model::{Model, Plan};
 use crate::body::window::Window;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
-use crate::model::{Model, Plan};
 use crate::response::tangent::{LinearPatch, Tangent};
-use crate::state::saved::{Checks, SavedContact, SavedTip, ensure};
+use crate::saved::{Checks, SavedContact, SavedTip, ensure};
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_refusal::Result;
 

@@ -2,5 +2,5 @@
 
 pub(crate) mod applied_force;
 pub(crate) mod contact;
-pub(crate) mod position_control;
+pub(crate) mod input;
 pub(crate) mod prescribed;

@@ -271,7 +271,7 @@ fn cell(sheet: &Sheet, axis: usize, at_m: f64) -> (usize, f64) {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::Model;
+    use crate::body::model::Model;
 
     /// Radii, in spacings.
     const RADII: [f64; 4] = [0.2, 1.0, 1.7, 3.2];

@@ -2,10 +2,10 @@
 
 use std::ops::Range;
 
+use crate::body::force_field::ForceChange;
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, TILE, sides_of, tile_of, tiles};
-use crate::tools::applied_force::ForceChange;
 
 /// Offsets of a tile's neighbours: along x, along y.
 const NEIGHBOURS: [[isize; 2]; 8] = [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
-use crate::model::Model;
+use crate::body::model::Model;
+use crate::saved::{SavedGeometry, ensure};
 use crate::scene::MeshShape;
 use crate::shape::PointId;
-use crate::state::saved::{SavedGeometry, ensure};
 use palpate_refusal::Result;
 
 /// A tool that touches nothing moves to another place of the surface if that is nearer by this part of the

@@ -9,6 +9,7 @@ use super::graph::{GraphFault, MeshGraph};
 use super::pack::MeshSprings;
 use super::slots::MeshSlots;
 use super::sweep::{MeshGrid, MeshSweep, Snapshot, gather};
+use crate::body::advance::AdvanceStage;
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::lanes::{Width, run, shape};
 use crate::kernel::real::Real;
@@ -16,7 +17,6 @@ use crate::kernel::region::Region;
 use crate::kernel::springs::SpringCoefficients;
 use crate::scene::{Integrator, Lanes};
 use crate::scheme::Scheme;
-use crate::scheme::advance::AdvanceStage;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::family::Family;
 

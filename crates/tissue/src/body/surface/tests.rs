@@ -12,7 +12,7 @@ use super::order::TILE_SLOTS;
 use super::pack::{Arrangement, MeshSprings};
 use super::slots::{MeshSlots, NO_VERTEX};
 use super::sweep::{MeshGrid, MeshSweep, Snapshot, gather};
-use crate::Model;
+use crate::body::model::Model;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::{Vector, Width, available, run, shape};
 use crate::kernel::real::Real;

@@ -14,7 +14,7 @@ use palpate_haptics::force_law::{Law, Row};
 
 use super::disc::Disc;
 use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
-use crate::Model;
+use crate::body::model::Model;
 use crate::body::window::half_window_m;
 use crate::response::tangent::{self, Accuracy, Course};
 

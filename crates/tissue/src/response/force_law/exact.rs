@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use palpate_haptics::force_law::{Law, Row};
 
 use super::disc::Disc;
-use crate::Model;
+use crate::body::model::Model;
 use crate::response::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
 
 /// Rows of an exact law.

@@ -5,7 +5,7 @@ use glam::DVec3;
 
 use super::*;
 use crate::scene::profile::Poke;
-use crate::sleep::tiles::CHECK_STEPS;
+use crate::state::sleep::tiles::CHECK_STEPS;
 use crate::{Grasp, Model, Push, Tissue};
 
 fn pushed<T: Real>(sets: &[&str], falloff_per_m: f64) -> TissueState<T> {

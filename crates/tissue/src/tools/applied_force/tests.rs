@@ -1,5 +1,7 @@
 //! Tests of tables that are placed again, and of the bound of a change of force.
 
+use std::ops::Range;
+
 use super::*;
 use crate::limits::Limits;
 use crate::scene::{PAPER, Scene};

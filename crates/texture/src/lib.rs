@@ -15,11 +15,11 @@ use std::path::Path;
 
 use bytes::Bytes;
 
-use crate::files;
-use crate::limits::Limits;
-use crate::memory;
-use crate::scene::{Appearance, PaintedSurface, SMALLEST_TEXTURE};
 use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_tissue::files;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::memory;
+use palpate_tissue::scene::{Appearance, PaintedSurface, SMALLEST_TEXTURE};
 
 /// An image: rows of pixels from the top, each from the left, in sRGB. [`painted`] and [`image`] create one.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,7 +50,7 @@ pub struct Texture {
 /// ```
 /// use palpate_tissue::limits::Limits;
 /// use palpate_tissue::scene::PaintedSurface;
-/// use palpate_tissue::texture::painted;
+/// use palpate_texture::painted;
 ///
 /// let limits = Limits::default();
 /// let image = painted(PaintedSurface::Liver, 1, 32, &limits)?;

@@ -21,13 +21,13 @@ pub struct Model {
     pub scene: Scene,
     /// Rows and columns in memory: those of a sheet, or the slots of a mesh in rows of [`BLOCK`] (a slot is a
     /// vertex's place in memory).
-    pub(super) points: [usize; 2],
+    pub(crate) points: [usize; 2],
     /// Row-major indices of the fixed points, ascending.
-    pub(super) fixed: Vec<usize>,
+    pub(crate) fixed: Vec<usize>,
     /// The unit of length: the distance between neighbours, m.
-    pub(super) unit_m: f64,
+    pub(crate) unit_m: f64,
     /// Where the points are in memory, and how they differ.
-    pub(super) places: Places,
+    pub(crate) places: Places,
     /// ω_b = √((λ + K″)/m), rad/s, for a point of the reference mass m; λ is the largest eigenvalue of the
     /// springs' stiffness, K″ that of an anchor spring ([`Oscillator::omega_bound_per_s`]). No vibration is
     /// faster, under any deformation.
@@ -57,7 +57,7 @@ pub struct Model {
     pub rehearsed: u64,
     /// By how much each place in memory lets a volume grow under a pressure, m³/Pa. Empty without a volume, or
     /// before it was computed.
-    pub(super) volume_compliance: Arc<[f64]>,
+    pub(crate) volume_compliance: Arc<[f64]>,
 }
 
 /// A scheme fitted to a substep: how a tissue is advanced by one step.
@@ -80,14 +80,14 @@ pub struct Plan {
 }
 
 impl Plan {
-    pub(super) fn new(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
+    pub(crate) fn new(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let plan = Plan::unjudged(integrator, substeps, step_s, sheet);
         let stable = stability::is_stable(&plan.scheme, sheet.scaled_spring_stiffness(plan.substep_s));
         Plan { stable, ..plan }
     }
 
     /// Creates a plan without checking its stability; a rehearsal detects an instability itself.
-    pub(super) fn unjudged(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
+    pub(crate) fn unjudged(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let substep_s = step_s / f64::from(substeps);
         let (a, g) = sheet.scaled(substep_s);
         let scheme = Scheme::fit(integrator, a, g);
@@ -96,23 +96,23 @@ impl Plan {
     }
 
     /// Returns the same scheme with `by` times the substeps.
-    pub(super) fn divided(&self, scene: &Scene, by: u32) -> Self {
+    pub(crate) fn divided(&self, scene: &Scene, by: u32) -> Self {
         Plan::new(self.integrator, self.substeps * by, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
     }
 
     /// Returns the work of a force of 1 in the fields of the tools along a displacement of 1, J.
-    pub(super) fn unit_of_work_j(&self, model: &Model) -> f64 {
+    pub(crate) fn unit_of_work_j(&self, model: &Model) -> f64 {
         model.unit_m / (self.scheme.impulse() * self.force_scale(&model.scene))
     }
 
     /// Returns the factor from newtons on a point of the reference mass to the unit of force of the springs' tables, 1/N.
-    pub(super) fn spring_unit(&self, scene: &Scene) -> f64 {
+    pub(crate) fn spring_unit(&self, scene: &Scene) -> f64 {
         self.scheme.spring_scale() * self.force_scale(scene)
     }
 
     /// Returns the factor from newtons on a point of the reference mass to the scheme's unit of force:
     /// dt²/(m·h), 1/N.
-    pub(super) fn force_scale(&self, scene: &Scene) -> f64 {
+    pub(crate) fn force_scale(&self, scene: &Scene) -> f64 {
         self.substep_s * self.substep_s / (scene.point_mass_kg() * scene.shape().edge_m())
     }
 }
@@ -136,7 +136,7 @@ impl Model {
     ///
     /// # Errors
     /// Returns the fault of a mesh whose springs can't be laid out.
-    pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
+    pub(crate) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
         let MemoryLayout { points, fixed, places } = MemoryLayout::of(&scene)?;
         Ok(Model {
             points,
@@ -159,7 +159,7 @@ impl Model {
 
     /// Returns the sleep tolerance of the tiles. Where nothing pulls a tissue back, nothing bounds how far an
     /// omitted force would move it; then only tiles that do not move at all may sleep.
-    pub(super) fn tile_tolerance(&self) -> f64 {
+    pub(crate) fn tile_tolerance(&self) -> f64 {
         if Relaxation::of(&self.scene).is_bounded() {
             self.sleep_tolerance
         } else {
@@ -212,17 +212,17 @@ impl Model {
     }
 
     /// Returns the number of places in memory; some places of a mesh are empty.
-    pub(super) fn place_count(&self) -> usize {
+    pub(crate) fn place_count(&self) -> usize {
         self.points[0] * self.points[1]
     }
 
     /// Returns the number of rows of a sheet over which a spring reaches.
-    pub(super) fn spring_rows(&self) -> usize {
+    pub(crate) fn spring_rows(&self) -> usize {
         if self.scene.springs.bending { 2 } else { 1 }
     }
 
     /// Returns the row-major place of a point in memory.
-    pub(super) fn place_of(&self, point: PointId) -> usize {
+    pub(crate) fn place_of(&self, point: PointId) -> usize {
         self.places.place_of(point)
     }
 
@@ -235,7 +235,7 @@ impl Model {
     }
 
     /// Returns the point at a place in memory; for an empty place, any point.
-    pub(super) fn point_at(&self, index: usize) -> PointId {
+    pub(crate) fn point_at(&self, index: usize) -> PointId {
         self.places.point_at(index)
     }
 
@@ -259,23 +259,23 @@ impl Model {
 
     /// Returns the mass at a place in memory divided by the reference mass. It divides a force there in the
     /// scheme's units ([`Plan::force_scale`]), and multiplies C.
-    pub(super) fn relative_mass_at(&self, index: usize) -> f64 {
+    pub(crate) fn relative_mass_at(&self, index: usize) -> f64 {
         self.places.relative_mass(index)
     }
 
     /// Returns K″/m at a place in memory divided by the reference value, minus 1.
-    pub(super) fn extra_anchor_at(&self, index: usize) -> f64 {
+    pub(crate) fn extra_anchor_at(&self, index: usize) -> f64 {
         self.places.extra_anchor(index)
     }
 
     /// Returns K″ at a place in memory divided by the reference value.
-    pub(super) fn relative_anchor_stiffness_at(&self, index: usize) -> f64 {
+    pub(crate) fn relative_anchor_stiffness_at(&self, index: usize) -> f64 {
         self.relative_mass_at(index) * (1.0 + self.extra_anchor_at(index))
     }
 
     /// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables in their unit
     /// ([`Plan::spring_unit`]) and the displacement in spacings.
-    pub(super) fn spring_force_n(&self, spring_unit: f64, index: usize, gathered: f64, u: f64) -> f64 {
+    pub(crate) fn spring_force_n(&self, spring_unit: f64, index: usize, gathered: f64, u: f64) -> f64 {
         let force_n = gathered / spring_unit;
         if !self.places.differ() {
             return force_n;
@@ -298,12 +298,12 @@ impl Model {
     }
 
     /// Returns the row and column of a row-major index.
-    pub(super) fn point_of(&self, index: usize) -> [usize; 2] {
+    pub(crate) fn point_of(&self, index: usize) -> [usize; 2] {
         [index / self.points[1], index % self.points[1]]
     }
 
     /// Returns the row-major index of a row and column.
-    pub(super) fn index_of(&self, [i, j]: [usize; 2]) -> usize {
+    pub(crate) fn index_of(&self, [i, j]: [usize; 2]) -> usize {
         i * self.points[1] + j
     }
 }

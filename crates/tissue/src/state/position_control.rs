@@ -5,10 +5,10 @@ use glam::DVec3;
 use palpate_haptics::ContactState;
 
 use crate::body::footprint::WeightedNode;
+use crate::body::model::{Model, Plan};
 use crate::body::tables::SweepTables;
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
-use crate::model::{Model, Plan};
 use crate::state::step_context::StepContext;
 use crate::tools::contact::{ContactForce, Contacts, Tool, ToolContact, displacement_m, movement_m, push, within_cone};
 use palpate_haptics::Coupling;

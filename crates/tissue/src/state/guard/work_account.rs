@@ -1,57 +1,12 @@
-//! The guard's account of work and energy, and the reasons for which a check fails.
+//! The guard's account of work and energy.
 
-use std::fmt;
-
-use crate::shape::PointName;
-use crate::state::saved::{SavedWork, ensure};
+use crate::interface::CheckFailure;
+use crate::saved::{SavedWork, ensure};
 use palpate_refusal::Result;
 
 /// Tolerance of the energy balance, as a fraction of the energy at the last survey plus the size of the tools' work:
 /// errors of the schemes at the stability bound.
 pub const MARGIN: f64 = 0.05;
-
-/// Reason why a check of the guard failed.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum CheckFailure {
-    /// A point is not finite, or is displaced by a billion times the tissue's size.
-    NotFinite {
-        /// One such point.
-        point: PointName,
-    },
-    /// The energy rose by more than the tools' work and the tolerance ([`MARGIN`]).
-    Energy {
-        /// Energy of springs, anchor springs and motion, J.
-        energy_j: f64,
-        /// That energy at the last survey, J.
-        before_j: f64,
-        /// Work of all tools since, J.
-        work_j: f64,
-    },
-    /// The springs' force is far from its prediction: by more than [`super::MAX_PREDICTION_ERROR`].
-    Prediction {
-        /// The resulting difference of a displacement, as a fraction of the largest displacement.
-        part: f64,
-    },
-}
-
-impl fmt::Display for CheckFailure {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            CheckFailure::NotFinite { point } => {
-                write!(f, "point {point} was not finite (or a billion tissues away)")
-            }
-            CheckFailure::Energy { energy_j, before_j, work_j } => {
-                write!(
-                    f,
-                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
-                )
-            }
-            CheckFailure::Prediction { part } => {
-                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
-            }
-        }
-    }
-}
 
 /// By how much an energy may rise without a cause.
 #[derive(Debug, Clone, Copy)]

@@ -27,16 +27,16 @@
 use std::cell::Cell;
 use std::ops::Range;
 
+use crate::body::force_field::ForceChange;
+use crate::body::model::Model;
 use crate::body::tile_graph::{TileGraph, Watches};
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, Region, sides_of, tile_of, tiles};
 use crate::memory;
-use crate::model::Model;
+use crate::saved::{SavedTile, SavedTiles, ensure, unsound};
 use crate::scene::Scene;
 use crate::scheme::Relaxation;
-use crate::state::saved::{SavedTile, SavedTiles, ensure, unsound};
-use crate::tools::applied_force::ForceChange;
 use palpate_refusal::Result;
 
 /// Steps between two checks of which tiles may sleep.

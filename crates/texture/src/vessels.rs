@@ -1,7 +1,7 @@
 //! Vessels: trees of strokes that meander, taper and branch.
 
 use super::noise::{bits, gradient, unit};
-use crate::memory;
+use palpate_tissue::memory;
 
 /// A piece of a vessel. Lengths are in sides of the image.
 #[derive(Debug, Clone, Copy)]

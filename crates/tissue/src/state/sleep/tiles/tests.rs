@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::*;
-use crate::Model;
+use crate::body::model::Model;
 use crate::body::sheet::tiles::SheetTiles;
 use crate::scene::profile::Poke;
 use crate::tools::applied_force::{Applied, Push};

@@ -1,16 +1,16 @@
 //! The physics of sleep: when tiles may sleep, when forces, grasped points and pressure wake them, and the energies of
 //! sleeping tiles. `tiles` keeps the sets.
 
+use crate::body::model::{Model, Plan};
 use crate::body::tables::SweepTables;
-use crate::guard::survey::{Forces, Survey, Write, energy_of};
 use crate::interface::Energy;
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
-use crate::model::{Model, Plan};
 use crate::scene::Precision;
 use crate::scheme::stability;
 use crate::scheme::{Oscillator, Relaxation};
-use crate::sleep::tiles::SleepTiles;
+use crate::state::guard::survey::{Forces, Survey, Write, energy_of};
+use crate::state::sleep::tiles::SleepTiles;
 use crate::state::step_context::StepContext;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;

@@ -1,6 +1,6 @@
 //! Colours, and images painted row by row.
 
-use crate::memory;
+use palpate_tissue::memory;
 
 /// A colour in sRGB; each part is from 0 to 1.
 pub(super) type Colour = [f32; 3];

@@ -9,6 +9,8 @@
 
 use std::cell::UnsafeCell;
 
+use crate::body::force_field::{self, Pull, Term};
+use crate::body::model::{Model, Plan};
 use crate::body::tables::SweepTables;
 use crate::interface::Energy;
 use crate::kernel::field::{BLOCK, Layout, State};
@@ -16,11 +18,9 @@ use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::stage::Stage;
-use crate::model::{Model, Plan};
 use crate::scheme::Scheme;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::observer::Observer;
-use crate::tools::applied_force::{self, Pull, Term};
 
 /// The result of a survey, in the scheme's units (`scheme`).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -222,7 +222,7 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
             debug_assert!(self.layout.holds(at, V::LANES) && V::LANES <= BLOCK);
             let column = at - row * stride;
             let Forces { terms, part, pull, .. } = self.forces;
-            let force = applied_force::force_on::<V, 1>(self.pulls, row, at);
+            let force = force_field::force_on::<V, 1>(self.pulls, row, at);
             let free = if self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             let (part, pull) = (V::of(T::of(part)), V::of(T::of(pull)));
             let zero = V::of(T::default());

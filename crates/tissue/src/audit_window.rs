@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::guard::checkpoint::Input;
-use crate::model::Model;
+use crate::body::model::Model;
+use crate::tools::input::ToolInput;
 
 /// Largest number of inputs in a window. With more, the window ends without a result.
 const MAX_INPUTS: usize = 4096;
@@ -15,7 +15,7 @@ const MAX_INPUTS: usize = 4096;
 /// the step that each precedes, its tool, and the input, in the order of arrival. `default()` allocates its
 /// memory, for 4096 inputs, so that stepping allocates none.
 #[derive(Debug)]
-pub struct WindowInputs(pub(crate) Vec<(u64, usize, Input)>);
+pub struct WindowInputs(pub(crate) Vec<(u64, usize, ToolInput)>);
 
 impl Default for WindowInputs {
     fn default() -> Self {
@@ -29,7 +29,7 @@ pub enum Mark {
     /// The window has begun, at this checkpoint: call [`SharedCheckpoint::open`] soon.
     Begin(SharedCheckpoint),
     /// The window has ended, at this checkpoint, with these inputs: for
-    /// [`WindowOpening::close`](super::audit::WindowOpening::close). No window is requested any more.
+    /// [`WindowOpening::close`](crate::select::audit::WindowOpening::close). No window is requested any more.
     End(SharedCheckpoint, WindowInputs),
     /// The window can't be audited, and none is requested any more: the guard went back, the tissue changed or
     /// was recovered, everything came to rest, there were more than 4096 inputs, or the end was not taken
@@ -93,7 +93,7 @@ pub(crate) enum AuditWindow {
 
 impl AuditWindow {
     /// Records an input of a tool.
-    pub(crate) fn input(&mut self, step: u64, tool: usize, input: &Input) {
+    pub(crate) fn input(&mut self, step: u64, tool: usize, input: &ToolInput) {
         let AuditWindow::Open(_, inputs) = self else { return };
         if inputs.0.len() < MAX_INPUTS {
             inputs.0.push((step, tool, input.clone()));

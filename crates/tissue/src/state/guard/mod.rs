@@ -17,12 +17,12 @@ pub(crate) mod work_account;
 
 use std::sync::Arc;
 
-use super::model::{Model, Plan};
+use crate::body::model::{Model, Plan};
 use crate::body::tables::Elastic;
-pub use crate::guard::work_account::{CheckFailure, MARGIN};
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
 use crate::memory;
+pub use crate::state::guard::work_account::MARGIN;
 use crate::tools::applied_force::Applied;
 
 /// Number of substeps between two surveys, in which the guard checks the whole tissue and takes a checkpoint. A
@@ -30,7 +30,7 @@ use crate::tools::applied_force::Applied;
 pub const INTERVAL_SUBSTEPS: u64 = 256;
 
 /// Largest error of a predicted displacement, as a fraction of the largest displacement; beyond it the check fails
-/// with [`CheckFailure::Prediction`].
+/// with [`CheckFailure::Prediction`](crate::CheckFailure::Prediction).
 pub const MAX_PREDICTION_ERROR: f64 = 0.5;
 
 /// Largest number of times that a substep is halved (to a sixteenth) before the guard gives up and stops the tissue.

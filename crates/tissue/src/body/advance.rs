@@ -6,12 +6,12 @@
 
 use std::ops::Range;
 
+use crate::body::force_field::{self, Pull};
 use crate::kernel::field::{BLOCK, Layout};
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 use crate::kernel::stage::{ANY, ROW_LOADED, ROW_UNLOADED, Stage};
 use crate::scheme::arithmetic::{Arithmetic, MAX_KEPT};
-use crate::tools::applied_force::{self, Pull};
 
 /// The stage of a sweep that advances every point.
 pub(crate) struct AdvanceStage<'a, T: Real, C> {
@@ -54,7 +54,7 @@ impl<T: Real, C: Arithmetic<T>> Stage<T> for AdvanceStage<'_, T, C> {
         n: [V; 3],
         sums: &mut [V; 2],
     ) {
-        let reaches = || applied_force::reaches(self.pulls, row, at - row * self.layout.stride);
+        let reaches = || force_field::reaches(self.pulls, row, at - row * self.layout.stride);
         let forced = match DUTY {
             ROW_UNLOADED => false,
             ROW_LOADED => reaches(),
@@ -118,10 +118,10 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
                     work = V::load(self.work.add(column % BLOCK));
                 }
                 forces = Some(match (DUTY, C::FORCES) {
-                    (ROW_LOADED, 1) => applied_force::force_of::<V, 1>(&self.pulls[0], at),
-                    (ROW_LOADED, _) => applied_force::force_of::<V, 2>(&self.pulls[0], at),
-                    (_, 1) => applied_force::force_on::<V, 1>(self.pulls, row, at),
-                    _ => applied_force::force_on::<V, 2>(self.pulls, row, at),
+                    (ROW_LOADED, 1) => force_field::force_of::<V, 1>(&self.pulls[0], at),
+                    (ROW_LOADED, _) => force_field::force_of::<V, 2>(&self.pulls[0], at),
+                    (_, 1) => force_field::force_on::<V, 1>(self.pulls, row, at),
+                    _ => force_field::force_on::<V, 2>(self.pulls, row, at),
                 });
             }
             for c in 0..3 {

@@ -7,10 +7,10 @@
 
 use glam::DVec3;
 
+use crate::body::model::Model;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
-use crate::model::Model;
-use crate::state::saved::LARGEST;
+use crate::saved::LARGEST;
 use crate::tools::contact::{Contacts, Tool};
 use crate::tools::prescribed::Prescribed;
 use palpate_haptics::ContactState;

@@ -1,0 +1,40 @@
+//! The inputs of tools, as a tissue repeats them.
+
+use glam::DVec3;
+
+use crate::body::model::Model;
+use crate::saved::{Checks, SavedInput, SavedTip};
+use crate::tools::applied_force::Push;
+use crate::tools::prescribed::{Grasp, restored_index};
+use palpate_haptics::Tip;
+use palpate_refusal::Result;
+
+/// An input of a tool.
+#[derive(Debug, Clone)]
+pub(crate) enum ToolInput {
+    Push(Option<Push>),
+    Grasp(usize, Grasp),
+    Pose(DVec3, Tip),
+}
+
+impl ToolInput {
+    pub(crate) fn saved(&self) -> SavedInput {
+        match self {
+            ToolInput::Push(push) => SavedInput::Push(push.as_ref().map(Push::saved).map(Box::new)),
+            ToolInput::Grasp(index, grasp) => SavedInput::Grasp(*index as u64, grasp.saved()),
+            ToolInput::Pose(place_m, tip) => SavedInput::Pose((*place_m).into(), SavedTip::of(tip)),
+        }
+    }
+
+    pub(crate) fn restored(saved: &SavedInput, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        Ok(match saved {
+            SavedInput::Push(push) => {
+                ToolInput::Push(push.as_ref().map(|push| Push::restored(push, checks)).transpose()?)
+            }
+            SavedInput::Grasp(index, grasp) => {
+                ToolInput::Grasp(restored_index(model, *index, checks)?, Grasp::restored(grasp, checks)?)
+            }
+            SavedInput::Pose(place_m, tip) => ToolInput::Pose(checks.vector(*place_m)?, tip.restored(checks)?),
+        })
+    }
+}
