@@ -1,6 +1,7 @@
 //! The kinds of tissue, with one folder each: `sheet` and `surface` (meshes). Each has its layout, its sweep
 //! over the springs, and the contact of a disc with it.
 
+pub(crate) mod disc;
 pub(crate) mod footprint;
 pub(crate) mod sheet;
 pub mod surface;
@@ -16,11 +17,12 @@ use glam::DVec3;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::Width;
 use crate::kernel::real::Real;
+use crate::scene::graph::GraphFault;
 use crate::scene::profile::Poke;
 use crate::scene::{Body, Scene, Sheet};
-use crate::shape::{self, PointId, RestShape};
+use crate::shape::{self, PointId};
 use sheet::falloff::SheetPoints;
-use surface::{GraphFault, MeshPlaces, VolumePlaces};
+use surface::{MeshPlaces, VolumePlaces};
 
 /// The points of a scene in memory.
 pub(crate) struct MemoryLayout {
@@ -36,7 +38,7 @@ pub(crate) struct MemoryLayout {
 pub(crate) enum Places {
     /// The points of a sheet are in memory in their order, and alike.
     Sheet(SheetPoints),
-    /// The points of a mesh, and its springs.
+    /// Points in any arrangement, as of a mesh, and their springs.
     Surface(Arc<MeshPlaces>),
 }
 
@@ -44,7 +46,7 @@ impl MemoryLayout {
     /// Lays out the points of a scene.
     ///
     /// # Errors
-    /// Returns the fault of a mesh whose springs can't be laid out.
+    /// Returns the fault of springs that can't be laid out.
     pub(crate) fn of(scene: &Scene) -> Result<Self, GraphFault> {
         Ok(match &scene.body {
             Body::Sheet(sheet) => {
@@ -52,9 +54,10 @@ impl MemoryLayout {
                 let places = Places::Sheet(SheetPoints { points, spacing_m });
                 MemoryLayout { points, fixed: sheet.fixed_indices(), places }
             }
-            Body::Mesh(mesh) => {
-                let places = MeshPlaces::of(mesh)?;
-                let points = shape::points(&*mesh.shape).filter(|point| mesh.shape.is_fixed(*point));
+            body => {
+                let (kind, shape) = (body.kind(), body.kind().shape());
+                let places = MeshPlaces::of(kind, &kind.graph())?;
+                let points = shape::points(shape).filter(|point| shape.is_fixed(*point));
                 let mut fixed: Vec<usize> = points.map(|point| places.slot_of(point)).collect();
                 fixed.sort_unstable();
                 MemoryLayout { points: [places.rows(), BLOCK], fixed, places: Places::Surface(Arc::new(places)) }
@@ -164,12 +167,9 @@ impl Places {
         }
     }
 
-    /// Adds what tells the tissue of `scene` from another with the same coefficients to the bytes of its identity: its
-    /// kind, and on a mesh also points, order in memory and springs.
+    /// Adds what tells the tissue of `scene` from another with the same coefficients to the bytes of its identity.
     pub(crate) fn identify(&self, scene: &Scene, add: &mut impl FnMut(&[u8])) {
-        match (&scene.body, self) {
-            (Body::Mesh(mesh), Places::Surface(places)) => surface::identify(mesh, places, add),
-            _ => add(b"sheet"),
-        }
+        let order = self.surface().map_or(&[][..], |places| places.slots.vertex_of());
+        scene.body.kind().identify(order, add);
     }
 }
