@@ -51,6 +51,8 @@ pub struct Mesh {
     pub stiffest: StiffnessBound,
     /// The enclosed volume, if it resists changes (section `[volume]`, [`Mesh::enclosing`]); otherwise `None`.
     pub volume: Option<Arc<Volume>>,
+    /// Whether a movable point has no anchor, whatever K″ is: then nothing bounds how far a small force moves it.
+    has_free_point: bool,
 }
 
 /// Masses and stiffnesses of single points and springs, relative to the reference values of the scene. A list
@@ -181,7 +183,10 @@ impl Mesh {
     pub fn uneven(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>, differences: PerNodeFactors) -> Self {
         let stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor: 0.0 };
         let differences = Arc::new(differences);
-        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None };
+        let is_free =
+            |(vertex, extra): (usize, &f64)| *extra <= -1.0 && shape.is_used(vertex) && !shape.is_fixed[vertex];
+        let has_free_point = differences.extra_anchor.iter().enumerate().any(is_free);
+        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None, has_free_point };
         mesh.stiffest = mesh.find_stiffest();
         mesh
     }
@@ -478,6 +483,12 @@ impl BodyKind for Mesh {
 
     fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
         self.relative_mass(point) * (1.0 + self.extra_anchor(point))
+    }
+
+    /// Returns 0 if a movable point has no anchor: the springs to its neighbours resist a movement across them only as
+    /// it stretches them.
+    fn restoring_n_per_m(&self, anchor_n_per_m: f64) -> f64 {
+        if self.has_free_point { 0.0 } else { anchor_n_per_m }
     }
 
     fn volume(&self) -> Option<&Volume> {
