@@ -4,7 +4,6 @@ use std::fmt;
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::model::Model;
 use crate::shape::PointId;
 use crate::state::saved::SavedPlace;
 use palpate_refusal::Result;
@@ -38,9 +37,9 @@ pub(crate) trait Disc: fmt::Debug + Send + Sync {
     fn walk(&mut self, by_m: DVec2) -> bool;
 
     /// Moves to the place of the rest surface nearest to `place_m`, if the displaced surface is nearer there than at the
-    /// disc. `displacement_m` gives the displacement of a row and column in memory, m. Returns whether it moved; never
-    /// where walking leads everywhere.
-    fn leap(&mut self, _model: &Model, _place_m: DVec3, _displacement_m: &dyn Fn([usize; 2]) -> DVec3) -> bool {
+    /// disc. `displacement_m` gives the displacement of a point, m. Returns whether it moved; never where walking leads
+    /// everywhere.
+    fn leap(&mut self, _place_m: DVec3, _displacement_m: &dyn Fn(PointId) -> DVec3) -> bool {
         false
     }
 

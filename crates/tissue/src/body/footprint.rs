@@ -16,10 +16,8 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::body::disc::Disc;
-use crate::body::sheet::footprint::GridDisc;
-use crate::body::surface::footprint::MeshDisc;
+use crate::body::disc_on;
 use crate::model::Model;
-use crate::scene::Body;
 use crate::state::saved::{SavedPlace, ensure};
 use palpate_refusal::Result;
 
@@ -44,14 +42,6 @@ pub struct Footprint {
     along: [DVec3; 2],
     /// Σ w²/mass over the movable points.
     relative_inverse_mass: f64,
-}
-
-/// Returns a disc of `radius_m` (m) on a tissue, at an arbitrary place: the register of the kinds' discs.
-fn disc_on(body: &Body, radius_m: f64) -> Box<dyn Disc> {
-    match body {
-        Body::Sheet(sheet) => Box::new(GridDisc::new(sheet, radius_m)),
-        Body::Mesh(mesh) => Box::new(MeshDisc::new(&mesh.shape, radius_m)),
-    }
 }
 
 impl Clone for Footprint {
@@ -159,7 +149,8 @@ impl Footprint {
     /// Moves the disc of a tool that touches nothing to the place of the displaced surface nearest to
     /// `place_m`, or towards it. This converges if the surface is not folded.
     pub(crate) fn seek(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
-        if self.disc.leap(model, place_m, &displacement_m) {
+        let of_point = |point| displacement_m(model.point_of(model.place_of(point)));
+        if self.disc.leap(place_m, &of_point) {
             self.lay(model);
         }
         for _ in 0..2 {

@@ -12,8 +12,8 @@ pub struct MeshSpring {
     pub stiffness_n_per_m: f64,
 }
 
-/// Points and springs of a tissue in any arrangement, in the numbering of its rest shape: the input of
-/// [`MeshSlots::new`](crate::body::surface::MeshSlots::new), which checks it. Several springs may join the same points.
+/// Points and springs of a tissue in any arrangement, in the numbering of its rest shape. The kernel for meshes checks
+/// and takes it. Several springs may join the same points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshGraph {
     /// Rest position of each point, m; 1 to 2²⁸ points.

@@ -7,7 +7,6 @@ use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
 use crate::body::disc::Disc;
-use crate::model::Model;
 use crate::scene::MeshShape;
 use crate::shape::PointId;
 use crate::state::saved::{SavedPlace, ensure, unsound};
@@ -122,17 +121,13 @@ impl Disc for MeshDisc {
         moves
     }
 
-    fn leap(&mut self, model: &Model, place_m: DVec3, displacement_m: &dyn Fn([usize; 2]) -> DVec3) -> bool {
+    fn leap(&mut self, place_m: DVec3, displacement_m: &dyn Fn(PointId) -> DVec3) -> bool {
         let surface = self.shape.surface();
         let Some(other) = surface.nearest(place_m) else { return false };
         let away_m = |place: &Place| {
             let vertices = surface.triangle(place).map(|vertex| PointId::new(vertex as usize));
-            let moved_m: DVec3 = (0..3)
-                .map(|corner| {
-                    let point = model.point_of(model.place_of(vertices[corner]));
-                    place.barycentric[corner] * displacement_m(point)
-                })
-                .sum();
+            let moved_m: DVec3 =
+                (0..3).map(|corner| place.barycentric[corner] * displacement_m(vertices[corner])).sum();
             place_m.distance(surface.at_m(place) + moved_m)
         };
         let is_nearer = away_m(&other) < away_m(&self.place) - NEARER * self.disc.radius_m();
