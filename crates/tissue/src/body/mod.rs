@@ -59,21 +59,17 @@ impl MemoryLayout {
     /// # Errors
     /// Returns the fault of springs that can't be laid out.
     pub(crate) fn of(scene: &Scene) -> Result<Self, GraphFault> {
-        Ok(match &scene.body {
-            Body::Sheet(sheet) => {
-                let Sheet { points, spacing_m, .. } = *sheet;
-                let places = Places::Sheet(SheetPoints { points, spacing_m });
-                MemoryLayout { points, fixed: sheet.fixed_indices(), places }
-            }
-            body => {
-                let (kind, shape) = (body.kind(), body.kind().shape());
-                let places = MeshPlaces::of(kind, &kind.graph())?;
-                let points = shape::points(shape).filter(|point| shape.is_fixed(*point));
-                let mut fixed: Vec<usize> = points.map(|point| places.slot_of(point)).collect();
-                fixed.sort_unstable();
-                MemoryLayout { points: [places.rows(), BLOCK], fixed, places: Places::Surface(Arc::new(places)) }
-            }
-        })
+        if let Body::Sheet(sheet) = &scene.body {
+            let Sheet { points, spacing_m, .. } = *sheet;
+            let places = Places::Sheet(SheetPoints { points, spacing_m });
+            return Ok(MemoryLayout { points, fixed: sheet.fixed_indices(), places });
+        }
+        let (kind, shape) = (scene.body.kind(), scene.shape());
+        let places = MeshPlaces::of(kind, &kind.graph())?;
+        let points = shape::points(shape).filter(|point| shape.is_fixed(*point));
+        let mut fixed: Vec<usize> = points.map(|point| places.slot_of(point)).collect();
+        fixed.sort_unstable();
+        Ok(MemoryLayout { points: [places.rows(), BLOCK], fixed, places: Places::Surface(Arc::new(places)) })
     }
 }
 

@@ -511,28 +511,19 @@ impl Scene {
 
     /// Returns the grid, borrowed; `None` if the tissue is a mesh.
     pub fn sheet(&self) -> Option<&Sheet> {
-        match &self.body {
-            Body::Sheet(sheet) => Some(sheet),
-            _ => None,
-        }
+        if let Body::Sheet(sheet) = &self.body { Some(sheet) } else { None }
     }
 
     /// Returns the grid, mutable; `None` if the tissue is a mesh. Check the scene after changing it
     /// ([`Scene::check`]).
     pub fn sheet_mut(&mut self) -> Option<&mut Sheet> {
-        match &mut self.body {
-            Body::Sheet(sheet) => Some(sheet),
-            _ => None,
-        }
+        if let Body::Sheet(sheet) = &mut self.body { Some(sheet) } else { None }
     }
 
     /// Returns the triangle mesh that belongs to the scene besides its text: clients upload it, journals and other
     /// servers keep it, and frames show it. `None` if the text describes the whole tissue.
     pub fn mesh(&self) -> Option<&Mesh> {
-        match &self.body {
-            Body::Mesh(mesh) => Some(mesh),
-            _ => None,
-        }
+        if let Body::Mesh(mesh) = &self.body { Some(mesh) } else { None }
     }
 
     /// Returns the volume that a mesh encloses; `None` if the scene has no `[volume]`, as on any sheet.
@@ -687,11 +678,10 @@ impl Substance {
     pub fn enclosing(mut self, stiffness_pa: f64) -> Result<Self> {
         physical("volume.stiffness_pa", positive("volume.stiffness_pa", stiffness_pa)?)?;
         self.volume_stiffness_pa = stiffness_pa;
-        self.body = match self.body {
-            Body::Mesh(mesh) => Body::Mesh(mesh.enclosing()?),
-            _ => return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH)),
+        let Body::Mesh(mesh) = self.body else {
+            return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH));
         };
-        Ok(self)
+        Ok(Substance { body: Body::Mesh(mesh.enclosing()?), ..self })
     }
 }
 
@@ -715,10 +705,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
         }
     }
     let body = fields.required(section)?.table(|fields| Body::read(section, fields, files, of_material, limits))?;
-    let mesh = match body {
-        Body::Mesh(mesh) => mesh,
-        body => return read_coefficients(fields, body),
-    };
+    let Body::Mesh(mesh) = body else { return read_coefficients(fields, body) };
     if mesh.shape.point_count() > limits.points {
         mesh.check(limits)?;
     }
