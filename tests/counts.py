@@ -8,10 +8,12 @@ A type name means one thing: a public one is defined once in the workspace, a pr
 named MAX_…, MIN_… and …_TIMEOUT in every language. A cell of a table in ARCHITECTURE.md has at most 40 words. (Circles of imports
 are counted by tests/architecture.rs.)
 
-No line of Rust asks which kind of tissue it has, outside the places where a kind is at home: the folder `body` of the tissue,
-the text of scenes (`scene/mod.rs`, `scene/sheet.rs`, `scene/mesh.rs` and their folders), and the file that turns a scene into
-a message (`wire/scene.rs`). Elsewhere a line asks `BodyKind` or the rest shape. A line asks for a kind if it matches on one, unwraps
-the tables or the section of one, or compares the dimensions of a shape. Tests and benches may ask.
+No line asks which kind of tissue it has, outside the places where a user names a kind: the text of scenes (`scene/mod.rs`,
+`scene/sheet.rs`, `scene/mesh.rs` and their folders), the protocol's message of a scene (`wire/scene.rs`, and `proto/src/scene.rs`
+for programs that do not read it), the page's uploads and its sheet (`coefficients.ts`, `sheet.ts`), and the folder `body` of the tissue. Elsewhere a line asks
+`BodyKind`, the rest shape or `Places`. A line asks for a kind if it matches on one, unwraps the tables or the section of one,
+reads its field in a message or its key in a refusal, compares the dimensions of a shape, or has a name such as `is_mesh`.
+Tests and benches may ask.
 """
 
 import re
@@ -26,16 +28,25 @@ TYPE = re.compile(r"^[ \t]*(pub(?:\([^)]*\))?[ \t]+)?(?:struct|enum|union|trait|
 CONSTANT = re.compile(r"\b(?:PATIENCE(?:_\w+)?|MOST_\w+|LEAST_\w+|OFF_SHEET)\b")
 MAX_WORDS = 40
 GENERATED = "proto/generated/"
-ASKS = re.compile(
-    r"\bBody::(Sheet|Mesh)\b|\bElastic::(Sheet|Mesh)\b|\b(FootprintGeometry|SavedGeometry)::(Grid|Mesh)\b"
-    r"|\b(Places|TileGraph)::(Sheet|Surface)\b|\.dimensions\(\)\s*[=!<>]|\.sheet(_mut)?\(\)|\bplaces\.surface\(\)"
-)
+# What asks in each language, and where that is at home.
+ASKS = {
+    ".rs": re.compile(
+        r"\bBody::(Sheet|Mesh)\b|\bElastic::(Sheet|Mesh)\b|\b(Places|TileGraph)::(Sheet|Surface)\b|\bWindow::(Grid|Ball)\b"
+        r"|\.dimensions\(\)\s*[=!<>]|\.sheet(_mut)?\(\)|\bplaces\.surface\(\)|\bscene\.mesh\(\)|\bpb::(sheet::|mesh::|Sheet\b|Mesh\b)"
+        r"|\b(scene|message|told|of_scene|even)\.(sheet|mesh)\b(?!\()|\"(sheet|mesh)\.(points|spacing_m|file|unit|vertices|fixed)\w*\""
+        r"|\b(is|of|in|on)_(a_)?(sheet|mesh)(es|s)?\b"
+    ),
+    (".ts", ".mjs", ".js"): re.compile(r"\bscene[?!]?\.(sheet|mesh)\b|\bis(Sheet|Mesh)\b"),
+    (".py", ".pyi"): re.compile(r"\bscene\.(sheet|mesh)\b|\bis_(sheet|mesh)\b"),
+    (".h", ".c", ".hpp", ".cpp", ".cs"): re.compile(r"\bis_?(sheet|mesh)\b", re.IGNORECASE),
+}
 AT_HOME = ("crates/tissue/src/body/", "crates/tissue/src/scene/mod.rs", "crates/tissue/src/scene/sheet",
-           "crates/tissue/src/scene/mesh", "crates/session/src/wire/scene.rs")
+           "crates/tissue/src/scene/mesh", "crates/session/src/wire/scene.rs", "proto/src/scene.rs",
+           "clients/viewer/src/coefficients.ts", "clients/viewer/src/sheet.ts")
 OF_TESTS = re.compile(r"(^|/)(tests|benches|examples|fuzz)/|(^|/|_)tests\.rs$")
 
 
-def files(*endings):
+def files(endings):
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\n")
     here = Path(__file__).resolve()
     for name in listed:
@@ -63,7 +74,7 @@ def types():
 
 
 def constants():
-    for name, text in files(*CODE):
+    for name, text in files(CODE):
         for number, line in enumerate(text.split("\n"), 1):
             for match in CONSTANT.finditer(line):
                 yield f"{name}:{number}: {match[0]}"
@@ -79,13 +90,14 @@ def cells():
 
 
 def kinds():
-    for name, text in files(".rs"):
-        if name.startswith(AT_HOME) or OF_TESTS.search(name):
-            continue
-        own = re.split(r"^#\[cfg\(test\)\]", text, maxsplit=1, flags=re.MULTILINE)[0]
-        for number, line in enumerate(own.split("\n"), 1):
-            if ASKS.search(line) and not line.lstrip().startswith("//"):
-                yield f"{name}:{number}: {line.strip()}"
+    for endings, asks in ASKS.items():
+        for name, text in files(endings):
+            if name.startswith(AT_HOME) or OF_TESTS.search(name):
+                continue
+            own = re.split(r"^#\[cfg\(test\)\]", text, maxsplit=1, flags=re.MULTILINE)[0]
+            for number, line in enumerate(own.split("\n"), 1):
+                if asks.search(line) and not line.lstrip().startswith(("//", "#", "*", "/*")):
+                    yield f"{name}:{number}: {line.strip()}"
 
 
 COUNTS = {"types": types, "constants": constants, "cells": cells, "kinds": kinds}

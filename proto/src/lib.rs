@@ -10,6 +10,7 @@
 //! - [`measure`]: how much memory a message takes, measured before it is decoded; [`codec`]: decodes messages within
 //!   such limits.
 //! - `datagram` (feature `datagrams`): limits and conversions that both ends of datagrams share.
+//! - [`scene`]: what the message of a scene says about its tissue.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-haptics`.
 
 pub mod codec;
@@ -17,6 +18,7 @@ pub mod codec;
 pub mod datagram;
 pub mod geometry;
 pub mod measure;
+pub mod scene;
 pub mod touch;
 
 /// The generated code: messages, clients and servers of package `palpate.v1`.

@@ -39,12 +39,12 @@ impl DrawnSurface {
     /// Computes the surface from the frame that a viewer would get of `snapshot`.
     pub(super) fn new(shape: &dyn RestShape, skin: Option<&Skin>, snapshot: &Snapshot, refinement: Refinement) -> Self {
         match skin {
-            None => Self::of_sheet(snapshot, refinement),
-            Some(skin) => Self::of_mesh(shape, skin, snapshot, refinement),
+            None => Self::of_grid(snapshot, refinement),
+            Some(skin) => Self::of_skin(shape, skin, snapshot, refinement),
         }
     }
 
-    fn of_mesh(shape: &dyn RestShape, skin: &Skin, snapshot: &Snapshot, refinement: Refinement) -> Self {
+    fn of_skin(shape: &dyn RestShape, skin: &Skin, snapshot: &Snapshot, refinement: Refinement) -> Self {
         let moved_m = displacements(snapshot, refinement);
         let (least_m, longest_m) = (shape.extent().least_m, shape.longest_side_m());
         let rest_m: Vec<DVec3> = skin.vertices().iter().map(|vertex| skin.rest_m(*vertex)).collect();
@@ -109,7 +109,7 @@ impl DrawnSurface {
         }
     }
 
-    fn of_sheet(snapshot: &Snapshot, refinement: Refinement) -> Self {
+    fn of_grid(snapshot: &Snapshot, refinement: Refinement) -> Self {
         let points = refinement.coarsest();
         // Normals are interpolated between the points, so that shading is smooth: a bilinear patch has creases of its
         // own.

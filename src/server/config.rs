@@ -155,7 +155,7 @@ impl Config {
     pub fn check(&self) -> Result<()> {
         for (field, value) in [
             ("limits.point_force_n", self.limits.point_force_n),
-            ("limits.reach_in_sheets", self.limits.reach_in_sheets),
+            ("limits.reach_in_sides", self.limits.reach_in_sides),
             ("limits.session_rate_hz", self.limits.session_rate_hz),
             ("limits.periods_per_step", self.limits.periods_per_step),
             ("limits.commands_per_step", self.limits.commands_per_step),

@@ -8,7 +8,7 @@ use palpate_geometry::repair::{Repair, repair};
 use palpate_geometry::report::{Border, Finding};
 use palpate_geometry::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
 use palpate_proto::geometry::vector;
-use palpate_proto::pb;
+use palpate_proto::{pb, scene};
 
 use super::uploads::{FilePart, Received, UploadKind, Uploads};
 use palpate_refusal::{Reason, Refusal, Result, excerpt};
@@ -92,9 +92,9 @@ impl Meshes {
     pub(super) fn get(&self, id: &str, account: &Account) -> Result<Arc<TriangleMesh>> {
         if id.is_empty() {
             let message = "is missing: a client sends its mesh with UploadMesh, which tells its mesh_id";
-            return Err(Refusal::new(Reason::Missing, "scene.mesh.mesh_id", message));
+            return Err(Refusal::new(Reason::Missing, scene::MESH_ID, message));
         }
-        self.uploads.get(id, account).map_err(|refusal| refusal.within("scene.mesh"))
+        self.uploads.get(id, account).map_err(|refusal| refusal.within(scene::MESH))
     }
 
     /// Removes the meshes whose last part arrived too long ago.

@@ -303,7 +303,7 @@ fn copies(number: u32) -> Result<Option<Copies>, CodedError> {
     if number > 2 {
         return Err(CodedError::argument(format!("prediction is {number}: must be 0, 1 or 2")));
     }
-    Ok((number > 0).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: number == 2 }))
+    Ok((number > 0).then(|| Copies { make: Arc::new(journal::prediction), of_grids: number == 2 }))
 }
 
 /// The caller's function for messages, and its argument.

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ::palpate_session::wire::scene::{MeshToSend, SceneToSend};
 use palpate_client::bridge::{SessionChoice, Target};
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Credentials, Server, Token, fleet};
@@ -270,21 +271,18 @@ fn create_own(
     scene: &Scene,
     said: Option<MeshFile>,
 ) -> Result<*mut palpate_session, CodedError> {
-    let mut message = ::palpate_session::wire::scene::sent(scene);
-    if let Some((mesh, of_scene)) = scene.mesh().zip(message.mesh.as_mut()) {
-        // The number of vertices as requested in the file; the mesh may have fewer.
-        let vertices = said.and_then(|said| said.vertices);
-        of_scene.vertices = vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
-        let (name, bytes, unit) = sent::file(mesh);
+    let to_send = SceneToSend::of(scene, said.as_ref(), None);
+    let mut mesh_id = String::new();
+    if let Some(MeshToSend { name, bytes, unit }) = &to_send.upload {
         let calls = u32::try_from(bytes.len() / PART_BYTES).unwrap_or(u32::MAX).saturating_add(1);
-        let answer = shared.wait_for(calls, upload_mesh(shared.channel.clone(), name, &bytes, unit, false))?;
+        let answer = shared.wait_for(calls, upload_mesh(shared.channel.clone(), name, bytes, unit, false))?;
         if let Some(report) = answer.report.filter(|report| report.refused) {
             let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
             return Err(CodedError::argument(format!("the mesh can't be used: {}", what.unwrap_or_default())));
         }
-        of_scene.mesh_id = answer.mesh_id;
+        mesh_id = answer.mesh_id;
     }
-    create(shared, Source::Scene(message))
+    create(shared, Source::Scene(to_send.with_mesh_id(mesh_id)))
 }
 
 fn refused(refusal: Refusal) -> CodedError {

@@ -19,6 +19,6 @@ pub(crate) enum When {
 impl When {
     /// Returns the value for the options of a bridge.
     pub(crate) fn copies(self) -> Option<Copies> {
-        (self != When::Never).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: self == When::Always })
+        (self != When::Never).then(|| Copies { make: Arc::new(journal::prediction), of_grids: self == When::Always })
     }
 }

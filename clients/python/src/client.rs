@@ -401,7 +401,7 @@ impl RemoteSession {
         holder: &str,
         remember: bool,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let of_sheets = match prediction {
+        let of_grids = match prediction {
             "always" => Some(true),
             "auto" => Some(false),
             "never" => None,
@@ -410,7 +410,7 @@ impl RemoteSession {
                 return Err(wrong("prediction", message));
             }
         };
-        let copies = of_sheets.map(|of_sheets| Copies { make: Arc::new(journal::prediction), of_sheets });
+        let copies = of_grids.map(|of_grids| Copies { make: Arc::new(journal::prediction), of_grids });
         let device = Given::of(device)?;
         let lasts = seconds.or(device.lasts_s()).map(|seconds| duration("seconds", seconds)).transpose()?;
         let target = Target {

@@ -150,7 +150,7 @@ fn scene_of(own: Option<Arc<scene::Scene>>, session: &pb::Session) -> PyResult<A
         return Ok(own);
     }
     let told = session.scene.as_ref().ok_or_else(|| failed("the server sent no scene"))?;
-    if told.mesh.is_some() {
+    if palpate_proto::scene::mesh_id(told).is_some() {
         return Err(wrong("scene", "is missing: the session is on a mesh, whose scene you have to give"));
     }
     wire::scene::from_scene(told, None).map(Arc::new).map_err(refused)

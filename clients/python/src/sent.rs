@@ -6,8 +6,8 @@ use palpate_client::Channel;
 use palpate_client::upload::upload_mesh;
 use palpate_proto::pb;
 use palpate_refusal::{Reason, Refusal};
-use palpate_session::wire;
-use palpate_tissue::scene::sent::{self, mesh_file};
+use palpate_session::wire::scene::{MeshToSend, SceneToSend};
+use palpate_tissue::scene::sent::mesh_file;
 use pb::create_session_request::Source;
 use pyo3::PyResult;
 
@@ -18,45 +18,32 @@ use crate::scene::{Scene, limits};
 pub(crate) enum SessionSource {
     /// One of the server's scenes.
     Name(String),
-    Scene {
-        scene: Box<pb::Scene>,
-        /// The file of its mesh, in metres.
-        mesh: Option<Vec<u8>>,
-    },
+    Scene(Box<SceneToSend>),
 }
 
 impl SessionSource {
     /// Converts a scene that was read here.
     pub(crate) fn of(scene: &Scene) -> Result<Self, Refusal> {
-        let mut message = Box::new(wire::scene::sent(&scene.scene));
-        let Some(mesh) = scene.scene.mesh() else {
-            return Ok(SessionSource::Scene { scene: message, mesh: None });
-        };
         let file = Path::new(&scene.place);
-        // The number of vertices as requested in the file; the mesh may have fewer.
-        if file.is_file()
-            && let Some(told) = &mut message.mesh
-            && let Some(said) = mesh_file(file, &limits())?
-        {
-            told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
-        }
-        Ok(SessionSource::Scene { scene: message, mesh: Some(sent::file(mesh).1) })
+        let said = if file.is_file() { mesh_file(file, &limits())? } else { None };
+        Ok(SessionSource::Scene(Box::new(SceneToSend::of(&scene.scene, said.as_ref(), None))))
     }
 
     /// Returns the source for the server; uploads the mesh, if there is one.
     pub(crate) async fn source(self, channel: Channel) -> PyResult<Source> {
-        let (mut scene, mesh) = match self {
+        let scene = match self {
             SessionSource::Name(name) => return Ok(Source::SceneName(name)),
-            SessionSource::Scene { scene, mesh } => (scene, mesh),
+            SessionSource::Scene(scene) => scene,
         };
-        if let (Some(file), Some(of_scene)) = (mesh, &mut scene.mesh) {
-            let answer = upload_mesh(channel, "mesh.obj", &file, "m", false).await.map_err(of_status)?;
+        let mut mesh_id = String::new();
+        if let Some(MeshToSend { name, bytes, unit }) = &scene.upload {
+            let answer = upload_mesh(channel, name, bytes, unit, false).await.map_err(of_status)?;
             if let Some(report) = answer.report.filter(|report| report.refused) {
                 let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
                 return Err(refused(Refusal::new(Reason::OutOfRange, "scene", what.unwrap_or_default())));
             }
-            of_scene.mesh_id = answer.mesh_id;
+            mesh_id = answer.mesh_id;
         }
-        Ok(Source::Scene(*scene))
+        Ok(Source::Scene(scene.with_mesh_id(mesh_id)))
     }
 }

@@ -1,35 +1,30 @@
 //! Scenes by name or from files, converted for a server. The mesh of a scene file is uploaded before the scene.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Error};
 use palpate_geometry::{Group, TriangleMesh};
-use palpate_proto::pb;
+use palpate_proto::{pb, scene};
 use palpate_refusal::Refusal;
 use palpate_session::wire;
+use palpate_session::wire::scene::{MeshToSend, SceneToSend};
 use palpate_tissue::files;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
-use palpate_tissue::scene::sent::{self, mesh_file};
+use palpate_tissue::scene::sent::mesh_file;
 use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
 
 /// The scene of sessions to create: the name of one of the server's scenes, or a scene read from a file with its mesh.
-pub struct SceneFile {
-    source: Source,
-    /// The scene, if it was read from a file.
-    own: Option<Scene>,
-    /// The mesh to upload.
-    mesh: Option<MeshToSend>,
-}
+pub struct SceneFile(SceneOrigin);
 
-struct MeshToSend {
-    name: String,
-    bytes: Vec<u8>,
-    unit: String,
+enum SceneOrigin {
+    Name(String),
+    /// A scene, and how it is sent.
+    Own(Box<(Scene, SceneToSend)>),
 }
 
 impl SceneFile {
@@ -41,34 +36,23 @@ impl SceneFile {
     pub fn read(scene: &str) -> Result<Self, Refusal> {
         let file = Path::new(scene);
         if file.extension().is_none_or(|extension| extension != "toml") {
-            return Ok(SceneFile { source: Source::SceneName(scene.to_owned()), own: None, mesh: None });
+            return Ok(SceneFile(SceneOrigin::Name(scene.to_owned())));
         }
         let limits = Limits::default();
         let own = Scene::load(file, &[], &limits)?;
-        let mut message = wire::scene::sent(&own);
-        let mesh = match own.mesh() {
-            None => None,
-            Some(mesh) => {
-                let said = mesh_file(file, &limits)?.unwrap_or_default();
-                if let Some(told) = &mut message.mesh {
-                    told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
-                }
-                // Files that a textual glTF file refers to are not uploaded; a rewritten mesh contains everything.
-                let whole = said.path.filter(|path| path.extension().is_none_or(|extension| extension != "gltf"));
-                Some(match whole {
-                    Some(path) => {
-                        let bytes = files::read_regular(&path, limits.mesh_bytes)?;
-                        let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
-                        MeshToSend { name: name.unwrap_or_default(), bytes, unit: said.unit }
-                    }
-                    None => {
-                        let (name, bytes, unit) = sent::file(mesh);
-                        MeshToSend { name: name.to_owned(), bytes, unit: unit.to_owned() }
-                    }
-                })
+        let said = mesh_file(file, &limits)?;
+        // Files that a textual glTF file refers to are not uploaded; a rewritten mesh contains everything.
+        let whole = |path: &&PathBuf| path.extension().is_none_or(|extension| extension != "gltf");
+        let mesh = match said.as_ref().and_then(|said| Some((said.path.as_ref().filter(whole)?, said))) {
+            Some((path, said)) => {
+                let bytes = files::read_regular(path, limits.mesh_bytes)?;
+                let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
+                Some(MeshToSend { name: name.unwrap_or_default(), bytes, unit: said.unit.clone() })
             }
+            None => None,
         };
-        Ok(SceneFile { source: Source::Scene(message), own: Some(own), mesh })
+        let to_send = SceneToSend::of(&own, said.as_ref(), mesh);
+        Ok(SceneFile(SceneOrigin::Own(Box::new((own, to_send)))))
     }
 
     /// Returns the source of a session for a call to create it. Uploads the mesh of the file, if there is one, at each
@@ -78,18 +62,20 @@ impl SceneFile {
     /// Returns [`Error::Call`] if the server refuses the upload or the connection breaks, and [`Error::Argument`] with
     /// the first problem if the server can't use the mesh.
     pub async fn source(&self, channel: Channel) -> Result<Source, Error> {
-        let mut source = self.source.clone();
-        if let (Source::Scene(scene), Some(MeshToSend { name, bytes, unit })) = (&mut source, &self.mesh) {
+        let to_send = match &self.0 {
+            SceneOrigin::Name(name) => return Ok(Source::SceneName(name.clone())),
+            SceneOrigin::Own(own) => &own.1,
+        };
+        let mut mesh_id = String::new();
+        if let Some(MeshToSend { name, bytes, unit }) = &to_send.upload {
             let sent = upload_mesh(channel, name, bytes, unit, false).await?;
             if let Some(report) = sent.report.filter(|report| report.refused) {
                 let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
                 return Err(Error::Argument(format!("{name}: {}", what.unwrap_or_default())));
             }
-            if let Some(mesh) = &mut scene.mesh {
-                mesh.mesh_id = sent.mesh_id;
-            }
+            mesh_id = sent.mesh_id;
         }
-        Ok(source)
+        Ok(Source::Scene(to_send.with_mesh_id(mesh_id)))
     }
 
     /// Returns the scene of `session`, which the server has created from this source: that of the file if it has a
@@ -102,17 +88,14 @@ impl SceneFile {
     pub async fn scene(&self, session: &pb::Session, channel: Channel) -> Result<Scene, Error> {
         let told = session.scene.as_ref().ok_or_else(|| Error::Connection("the server sent no scene".to_owned()))?;
         let wrong = |refusal: Refusal| Error::Argument(refusal.to_string());
-        match (&self.own, &told.mesh) {
-            (_, None) => wire::scene::from_scene(told, None).map_err(wrong),
-            (Some(own), Some(_)) => Ok(own.clone()),
-            (None, Some(_)) => {
+        if scene::mesh_id(told).is_none() {
+            return wire::scene::from_scene(told, None).map_err(wrong);
+        }
+        match &self.0 {
+            SceneOrigin::Own(own) => Ok(own.0.clone()),
+            SceneOrigin::Name(_) => {
                 let mesh = server_mesh(&session.session_id, channel).await?;
-                // The coefficients that follow from a material are sent as well.
-                let mut even = pb::Scene { material: None, inclusions: Vec::new(), ..told.clone() };
-                // Scripts name the vertices of the file. Only the server knows which point of a coarser mesh each one
-                // belongs to.
-                even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
-                wire::scene::from_scene(&even, Some(&mesh)).map_err(wrong)
+                wire::scene::from_told(told, &mesh).map_err(wrong)
             }
         }
     }

@@ -8,7 +8,7 @@ import type { Session } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
-import { Sheet } from "./sheet";
+import { gridOf, Sheet } from "./sheet";
 import type { Place, Surface } from "./surface";
 
 /** Interval between two requests for the session's status. */
@@ -62,8 +62,8 @@ export class ShownSession {
   private readonly mesh: MeshData | undefined;
 
   /**
-   * Loads what the session shows; for a body, this includes its mesh. With `former`, takes over the surface of a
-   * session with the same tissue.
+   * Loads what the session shows: the surface of every tissue whose points are no grid. With `former`, takes over the
+   * surface of a session with the same tissue.
    */
   static async to(
     session: Session,
@@ -73,7 +73,7 @@ export class ShownSession {
     former?: ShownSession,
   ): Promise<ShownSession> {
     check(session);
-    const mesh = former ? former.mesh : session.scene?.mesh && (await fetchMesh(server, session.sessionId));
+    const mesh = former ? former.mesh : gridOf(session.scene) ? undefined : await fetchMesh(server, session.sessionId);
     return new ShownSession(session, holder, refinement, told, mesh, former);
   }
 
@@ -87,9 +87,9 @@ export class ShownSession {
   ) {
     this.mesh = mesh;
     this.edgeM = mesh?.edgeM ?? 0;
-    const sheet = session.scene?.sheet;
+    const grid = gridOf(session.scene);
     const count = mesh ? mesh.restM.length / 3 : 1;
-    this.points = mesh ? [count, 1] : [sheet?.pointsX ?? 1, sheet?.pointsY ?? 1];
+    this.points = mesh ? [count, 1] : (grid?.points ?? [1, 1]);
     this.rateHz = session.scene?.stepping?.rateHz ?? 1000;
     const k = session.scene?.springs?.stiffnessNPerM ?? 0;
     const anchor = session.scene?.anchorSprings?.stiffnessNPerM ?? 0;
@@ -106,7 +106,7 @@ export class ShownSession {
       this.widthM = sizeM;
     } else {
       // A push falls off over a spacing, so that a few points share it: its depth is about two spacings.
-      const lengthM = sheet?.spacingM ?? 1;
+      const lengthM = grid?.spacingM ?? 1;
       const mostN = 2 * lengthM * (2 * k + anchor) || lengthM;
       this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM };
       this.widthM = (this.points[0] - 1) * lengthM;
@@ -186,7 +186,7 @@ export class ShownSession {
 
   /** Switches to another refinement of a sheet, with a new surface. */
   refine(n: number): Surface {
-    if (this.session.scene?.mesh) return this.surface;
+    if (this.mesh) return this.surface;
     this.refinement = n;
     this.surface = this.newSheet();
     if (!this.seen.signal.aborted) this.watch();
@@ -277,14 +277,15 @@ export class ShownSession {
 /** Throws if a session can't be shown, whatever its server claims. */
 function check({ scene }: Session): void {
   const isPositive = (value = 1) => Number.isFinite(value) && value > 0;
-  const { sheet, stepping, springs, anchorSprings } = scene ?? {};
+  const { stepping, springs, anchorSprings } = scene ?? {};
+  const grid = gridOf(scene);
   const isNumber = (value = 0) => Number.isFinite(value);
   if (!isPositive(stepping?.rateHz)) throw new RangeError(`it has ${stepping?.rateHz} steps a second`);
   if (!isNumber(springs?.stiffnessNPerM) || !isNumber(anchorSprings?.stiffnessNPerM)) throw new RangeError("its springs are no numbers");
-  if (!sheet) return;
-  const { pointsX = 1, pointsY = 1, spacingM } = sheet;
-  if (pointsX < 1 || pointsY < 1 || pointsX * pointsY > MAX_POINTS || !isPositive(spacingM)) {
-    throw new RangeError(`it is a sheet of ${pointsX} × ${pointsY} points, ${spacingM} m apart`);
+  if (!grid) return;
+  const [pointsX, pointsY] = grid.points;
+  if (pointsX < 1 || pointsY < 1 || pointsX * pointsY > MAX_POINTS || !isPositive(grid.spacingM)) {
+    throw new RangeError(`it is a sheet of ${pointsX} × ${pointsY} points, ${grid.spacingM} m apart`);
   }
 }
 

@@ -4,6 +4,7 @@
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Plane, type Ray, Vector3 } from "three";
 import { Field, type Rectangle } from "palpate";
 import { SheetEdge } from "./sheet-edge";
+import type { Scene } from "palpate/v1";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
 
@@ -15,6 +16,15 @@ const WIDEST = 4;
 const BESIDE = 0.01;
 /** Number of points of a shaft that must be outside the tissue. */
 const CHECKED = 16;
+
+/**
+ * Returns the numbers of points along the sides of a scene's grid and their distance, m; undefined if its points are
+ * arranged in another way.
+ */
+export function gridOf(scene: Scene | undefined): { points: [number, number]; spacingM: number | undefined } | undefined {
+  const { pointsX = 1, pointsY = 1, spacingM } = scene?.sheet ?? {};
+  return scene?.sheet && { points: [pointsX, pointsY], spacingM };
+}
 
 export class Sheet implements Surface {
   readonly field: Field;

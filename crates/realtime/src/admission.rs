@@ -134,7 +134,7 @@ impl Pacer {
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         check_asked(scene, &self.limits)?;
-        let model = memory::attempt("sheet.points", || self.compile(scene, stop))?;
+        let model = memory::attempt(scene.body.kind().points_key(), || self.compile(scene, stop))?;
         let begin = Begin {
             id,
             first: model.clone(),
@@ -200,12 +200,14 @@ impl Pacer {
         } = begin;
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
-        let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
+        // What refusals of memory and of so many points name.
+        let points_key = first.scene.body.kind().points_key();
+        let skin = memory::attempt(points_key, || Ok(Skin::of(&first)))?;
         first.shape().prepare_contact();
         let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
-        let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
+        let memory = owner.take(Resource::Memory(Purpose::Session), bytes, points_key)?;
         // Allocated before the lock is taken, which every call needs.
-        let mut session = memory::attempt("sheet.points", session)?;
+        let mut session = memory::attempt(points_key, session)?;
         session.time_stages(self.measures_stages.load(Ordering::Relaxed).then_some(now_ns));
         let (model, step) = (session.model().clone(), session.step_count());
         let running = running && session.hold_reason().is_none();
@@ -295,7 +297,7 @@ impl Pacer {
             handle.adopt_waiting(waiting);
         }
         let mut running =
-            memory::attempt("sheet.points", || Ok(Box::new(SessionTask::new(handle.clone(), session, running))))?;
+            memory::attempt(points_key, || Ok(Box::new(SessionTask::new(handle.clone(), session, running))))?;
         running.until = until;
         running.frozen = frozen;
         running.publish_status();
@@ -306,7 +308,7 @@ impl Pacer {
         let points: usize = sessions.values().map(|handle| handle.model.len()).sum();
         if points + handle.model.len() > self.limits.points_in_all {
             let message = format!("the sessions of the server already have {points} points");
-            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
+            return Err(Refusal::new(Reason::TooMany, points_key, message));
         }
         sessions.insert(id, handle.clone());
         // No caller can name the session before this, so every request to it comes after this.

@@ -12,7 +12,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::scheme::Oscillator;
+use palpate_tissue::scheme::{Oscillator, Relaxation};
 use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Model, Plan, Push};
@@ -122,7 +122,7 @@ impl fmt::Display for CheckReport {
             scene.stepping.rate_hz
         )?;
         write!(f, "{}", self.prospect)?;
-        let slowest = (sheet.anchor_stiffness_n_per_m / sheet.mass_kg).sqrt();
+        let slowest = Relaxation::of(scene).slowest_per_s();
         writeln!(
             f,
             "frequencies   {:.3} Hz (a point on its anchor spring alone) to at most {:.3} Hz (ω_b = {:.4} rad/s, under any \

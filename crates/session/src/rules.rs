@@ -63,7 +63,7 @@ impl Rules {
     /// - a force whose size at its control point, |force|·e^{c′}, is above `limits.point_force_n`, or whose control point
     ///   is off the tissue by more than a tenth of its longest side;
     /// - a grasp of a fixed point;
-    /// - a grasp moved farther from rest, or a pose farther from the tissue's middle, than `limits.reach_in_sheets`
+    /// - a grasp moved farther from rest, or a pose farther from the tissue's middle, than `limits.reach_in_sides`
     ///   times its longest side;
     /// - a pose with a velocity that has no client time or has a step ([`Reason::Missing`]);
     /// - a tip that does not fit the tissue.

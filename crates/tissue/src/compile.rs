@@ -126,7 +126,7 @@ impl Model {
     /// - more substeps than `limits.substeps`, which stability needs ([`Reason::TooLarge`]);
     /// - a tolerance whose rehearsals would take more than `limits.rehearsal_work` ([`Reason::TooLarge`]);
     /// - `compensated` with an integrator that is not exponential;
-    /// - a mesh whose springs can't be laid out in memory.
+    /// - springs that can't be laid out in memory.
     pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
         Model::compile_until(scene, limits, &scheme_selection::NEVER)
     }
@@ -186,7 +186,7 @@ impl Model {
             SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
         });
         let model = Model::planned(scene.clone(), plan, precision, lanes)
-            .map_err(|fault| Refusal::new(Reason::OutOfRange, "mesh.file", fault.to_string()))?;
+            .map_err(|fault| Refusal::new(Reason::OutOfRange, scene.body.kind().points_key(), fault.to_string()))?;
         let volume_compliance = tangent::volume_compliance(&model, stop).into();
         let mut model = Model { expected_error, sleep_tolerance, warnings, rehearsed, volume_compliance, ..model };
         model.warn_of_error(limits);
@@ -261,7 +261,7 @@ impl Model {
     /// - a sleep tolerance beyond 0 to 1, an integrator or format `auto`, 0 substeps, an expected error that is
     ///   NaN;
     /// - `compensated` with an integrator that is not exponential, more substeps than `limits.substeps`;
-    /// - lanes that this processor does not have, and a mesh whose springs can't be laid out in memory.
+    /// - lanes that this processor does not have, and springs that can't be laid out in memory.
     pub fn resumed(first: &Scene, state: &SavedPlan, limits: &Limits) -> Result<Arc<Self>> {
         let SavedPlan { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
         let mut scene = first.clone();

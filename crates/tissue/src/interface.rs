@@ -78,7 +78,8 @@ pub enum CheckFailure {
         /// Work of all tools since, J.
         work_j: f64,
     },
-    /// The springs' force is far from its prediction: by more than [`MAX_PREDICTION_ERROR`](crate::guard::MAX_PREDICTION_ERROR).
+    /// The springs' force is far from its prediction: by more than
+    /// [`MAX_PREDICTION_ERROR`](crate::guard::MAX_PREDICTION_ERROR).
     Prediction {
         /// The resulting difference of a displacement, as a fraction of the largest displacement.
         part: f64,

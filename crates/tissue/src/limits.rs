@@ -17,7 +17,7 @@ pub struct Limits {
     pub point_force_n: f64,
     /// How far a grasped point may be moved from its rest position, and a tool's tip from the middle of the
     /// tissue, as a multiple of the tissue's longest side. Default: 10.
-    pub reach_in_sheets: f64,
+    pub reach_in_sides: f64,
     /// Bytes of a scene or script file, or of an image for the surface. Default: 16 MiB.
     pub file_bytes: u64,
     /// Bytes of a trace file. Default: 64 MiB.
@@ -141,7 +141,7 @@ impl Default for Limits {
             points: 1 << 22,
             substeps: 100_000,
             point_force_n: 1e4,
-            reach_in_sheets: 10.0,
+            reach_in_sides: 10.0,
             file_bytes: 16 << 20,
             trace_bytes: 64 << 20,
             mesh_bytes: 64 << 20,

@@ -252,7 +252,7 @@ pub(crate) struct SavedGrasped {
 pub(crate) struct SavedContact {
     pub(crate) number: u64,
     pub(crate) tip: SavedTip,
-    pub(crate) ground: SavedGeometry,
+    pub(crate) place: SavedPlace,
     pub(crate) from_m: Vector,
     pub(crate) to_m: Vector,
     /// 0 free, 1 sticking, 2 sliding, 3 holding.
@@ -267,11 +267,12 @@ pub(crate) struct SavedContact {
     pub(crate) velocity_m_per_s: Vector,
 }
 
-/// The place of a tip's disc on the tissue.
+/// The place of a tip's disc on the tissue at rest, as the kind of tissue describes its places: in the plane z = 0, m, or
+/// on a triangle of the surface, with the two directions along it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub(crate) enum SavedGeometry {
-    Grid([f64; 2]),
-    Mesh { triangle: u32, barycentric: Vector, frame: [Vector; 2] },
+pub(crate) enum SavedPlace {
+    OfPlane([f64; 2]),
+    OfTriangle { triangle: u32, barycentric: Vector, frame: [Vector; 2] },
 }
 
 /// A [`Poke`] as plain data, in a snapshot: a point or a centre (m), a force (N) and its falloff. Nothing of it is

@@ -6,6 +6,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use glam::{DVec2, DVec3};
+use palpate_geometry::Group;
 use serde::Serialize;
 
 use palpate_refusal::{Reason, Refusal, Result, finite, legible};
@@ -147,6 +148,34 @@ pub struct Deepest {
     pub rest_m: DVec3,
 }
 
+/// A place at a height above a triangle of the simulated surface. It moves and turns with the triangle: with the
+/// corners a, b, c and the weights u, v, w it is at u·a + v·b + w·c + height·n, n the unit normal.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BoundPlace {
+    /// The number of the triangle ([`RestShape::triangles`]), from 0.
+    pub triangle: u32,
+    /// Barycentric weights of the triangle's three vertices, in its order; each is at least 0 (but for
+    /// rounding), and their sum is 1.
+    pub barycentric: [f64; 3],
+    /// Height of the place above the triangle at rest, along its normal, m; negative below it.
+    pub height_m: f64,
+}
+
+/// The surface by which frames show a tissue whose points are no grid ([`RestShape::shown_surface`]). Vertices are numbered
+/// as people and files number them.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct ShownShape<'s> {
+    /// Rest position of each vertex, m, in the tissue's frame.
+    pub vertices_m: &'s [DVec3],
+    /// The triangles, each as three vertices, anticlockwise seen from outside.
+    pub triangles: &'s [[u32; 3]],
+    /// Named groups of vertices; empty if there are none.
+    pub groups: &'s [Group],
+    /// How each vertex moves with a triangle of the simulated points ([`RestShape::triangles`]). Empty if the vertices are
+    /// the points themselves, in their order.
+    pub bound: &'s [BoundPlace],
+}
+
 /// The rest shape of a tissue: its points, in the tissue's frame (the axes of the scene or mesh file, m).
 /// Points are numbered from 0 without a gap. It never changes. A method that takes a [`PointId`] panics if the
 /// shape has no such point.
@@ -232,13 +261,27 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         None
     }
 
-    /// Returns the triangles of the surface, each by its corners ([`PointId::index`]), counter-clockwise from outside.
-    fn triangles(&self) -> Vec<[u32; 3]>;
+    /// Returns the triangles of the surface whose corners are points, each by these ([`PointId::index`]), counter-clockwise
+    /// from outside; none if no part of the surface has points as its corners.
+    fn triangles(&self) -> Vec<[u32; 3]> {
+        Vec::new()
+    }
 
-    /// Returns the number of vertices that frames show without refinement: the points, or the vertices of the file if
-    /// the tissue is simulated more coarsely than that.
+    /// Returns the surface that frames show; `None` if the points are a grid, which frames show by its rows.
+    fn shown_surface(&self) -> Option<ShownShape<'_>> {
+        None
+    }
+
+    /// Returns the texture coordinates (u, v) of each vertex of [`RestShape::shown_surface`], if it has them. It unwinds
+    /// with a refusal if there is no memory for them.
+    fn shown_uv(&self) -> Option<Vec<[f32; 2]>> {
+        None
+    }
+
+    /// Returns the number of vertices that frames show without refinement: those of [`RestShape::shown_surface`], or the
+    /// points.
     fn shown_count(&self) -> usize {
-        self.point_count()
+        self.shown_surface().map_or(self.point_count(), |shown| shown.vertices_m.len())
     }
 
     /// Returns whether the tissue is the same everywhere but near its rim and its listed fixed points, so that one

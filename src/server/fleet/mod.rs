@@ -299,7 +299,7 @@ impl Fleet {
         // An uploaded mesh or journal is on this server.
         let is_anywhere = match &request.source {
             Some(Source::SceneName(_)) => true,
-            Some(Source::Scene(scene)) => scene.mesh.is_none(),
+            Some(Source::Scene(scene)) => palpate_proto::scene::mesh_id(scene).is_none(),
             _ => false,
         };
         if !is_anywhere {

@@ -44,10 +44,10 @@ pub(super) struct Copying {
 }
 
 impl Copying {
-    /// Creates the copying of a session's tissue, if `copier` copies tissues of that kind.
+    /// Creates the copying of a session's tissue, if `copier` copies such tissues.
     pub(super) fn new(copier: Option<&Copier>, session: &pb::Session, channel: Channel, tip: Tip) -> Self {
-        let is_mesh = session.scene.as_ref().is_some_and(|scene| scene.mesh.is_some());
-        let copier = copier.filter(|copier| is_mesh || copier.copies.of_sheets).cloned();
+        let is_grid = session.scene.as_ref().is_some_and(|scene| palpate_proto::scene::grid(scene).is_some());
+        let copier = copier.filter(|copier| !is_grid || copier.copies.of_grids).cloned();
         Copying { channel, session_id: session.session_id.clone(), tip, copier, under_way: JoinSet::new() }
     }
 

@@ -86,8 +86,8 @@ pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String>
 pub struct Copies {
     /// The function that builds a copy.
     pub make: MakeCopy,
-    /// Whether to copy sheets too, for which local models are accurate anyway; otherwise only meshes.
-    pub of_sheets: bool,
+    /// Whether to copy tissues whose points are a grid too, for which local models are accurate anyway.
+    pub of_grids: bool,
 }
 
 /// A switch that stops the forces of a loop, from any thread, until the operator requests them again. All clones

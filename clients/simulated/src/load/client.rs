@@ -175,7 +175,7 @@ impl Client {
         };
         let touches = self.common.touches;
         if touches.is_some_and(|lead| lead.hand.is_none()) && self.stroke.place_m(0.0).is_none() {
-            return Err(tonic::Status::invalid_argument("--touch is for sheets: this scene has a mesh"));
+            return Err(tonic::Status::invalid_argument("--touch is for sheets: the points of this scene are no grid"));
         }
         let open = touches.map_or(open.clone(), |lead| tip::opening(open, &lead));
         let at_ns = Box::new([0; OUTSTANDING]);

@@ -6,6 +6,7 @@ use std::f64::consts::TAU;
 use glam::{DVec2, DVec3};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::pb;
+use palpate_proto::scene::{SceneGrid, grid};
 use pb::command::Action;
 
 /// A stroke over the tissue of a session.
@@ -22,8 +23,10 @@ pub(crate) struct Stroke {
 
 #[derive(Clone)]
 enum Over {
-    Sheet { middle_m: DVec2, radius_m: f64 },
-    Mesh { vertices: u32 },
+    /// A circle in the plane of a grid.
+    Circle { middle_m: DVec2, radius_m: f64 },
+    /// One vertex after another.
+    Vertices { count: u32 },
 }
 
 /// Number of vertices of a mesh that are pushed, one after the other, in a turn.
@@ -33,18 +36,16 @@ impl Stroke {
     /// Creates a stroke over a session's tissue, from the server's complete description of it.
     pub(crate) fn new(session: &pb::Session) -> Self {
         let scene = session.scene.clone().unwrap_or_default();
-        let (over, spacing_m) = match scene.sheet {
-            Some(sheet) => {
-                let spacing_m = sheet.spacing_m.unwrap_or(1.0);
-                let extent_m =
-                    spacing_m * DVec2::from([sheet.points_x, sheet.points_y].map(|n| f64::from(n.unwrap_or(1)) - 1.0));
-                (Over::Sheet { middle_m: extent_m / 2.0, radius_m: 0.25 * extent_m.min_element() }, spacing_m)
+        let (over, spacing_m) = match grid(&scene) {
+            Some(SceneGrid { points, spacing_m }) => {
+                let extent_m = spacing_m * DVec2::from(points.map(|count| f64::from(count) - 1.0));
+                (Over::Circle { middle_m: extent_m / 2.0, radius_m: 0.25 * extent_m.min_element() }, spacing_m)
             }
             None => {
                 let extent = session.extent.unwrap_or_default();
                 let size_m = from_vector(extent.most_m.as_ref()) - from_vector(extent.least_m.as_ref());
                 let vertices = session.points.max(1);
-                (Over::Mesh { vertices }, 2.0 * size_m.max_element().max(1e-6) / f64::from(vertices).sqrt())
+                (Over::Vertices { count: vertices }, 2.0 * size_m.max_element().max(1e-6) / f64::from(vertices).sqrt())
             }
         };
         let springs = scene.springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
@@ -66,9 +67,9 @@ impl Stroke {
     }
 
     /// Returns the place of a tip at `time_s`, m: the turn of [`Stroke::at`], pressed in as its force would; `None`
-    /// on a mesh.
+    /// where points are no grid.
     pub(crate) fn place_m(&self, time_s: f64) -> Option<DVec3> {
-        let Over::Sheet { middle_m, radius_m } = self.over else { return None };
+        let Over::Circle { middle_m, radius_m } = self.over else { return None };
         let turn = TAU * (0.5 * time_s + self.begin);
         let place_m = middle_m + radius_m * DVec2::new(turn.cos(), turn.sin());
         Some(place_m.extend(-self.depth_m * (0.6 + 0.4 * (3.0 * turn).sin())))
@@ -80,12 +81,12 @@ impl Stroke {
         let turns = 0.5 * time_s + self.begin;
         let turn = TAU * turns;
         let centre = match self.over {
-            Over::Sheet { middle_m, radius_m } => {
+            Over::Circle { middle_m, radius_m } => {
                 let centre_m = middle_m + radius_m * DVec2::new(turn.cos(), turn.sin());
                 pb::force::Centre::CentreM(pb::Vector2 { x: centre_m.x, y: centre_m.y })
             }
-            Over::Mesh { vertices } => {
-                pb::force::Centre::Vertex(((VERTICES_PER_TURN * turns) as u64 % u64::from(vertices)) as u32)
+            Over::Vertices { count } => {
+                pb::force::Centre::Vertex(((VERTICES_PER_TURN * turns) as u64 % u64::from(count)) as u32)
             }
         };
         Action::Force(pb::Force {

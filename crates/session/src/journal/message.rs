@@ -22,7 +22,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::saved::{CorrectedPlan, SavedPlan};
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
-use palpate_tissue::scene::{Appearance, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
+use palpate_tissue::scene::{Appearance, Integrator, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
 
 /// Least number of tools with which a journal is read, whatever the limits of this program are.
@@ -33,26 +33,11 @@ const MAX_TOOLS: u32 = 4096;
 /// more.
 pub fn limits(limits: &Limits) -> Limits {
     let tools = limits.tools.max(MAX_TOOLS);
-    Limits { point_force_n: f64::MAX, reach_in_sheets: f64::MAX, tools, ..limits.clone() }
+    Limits { point_force_n: f64::MAX, reach_in_sides: f64::MAX, tools, ..limits.clone() }
 }
 
-/// Returns the mesh of a scene, as its file or its client gave it.
-fn mesh(shape: &MeshShape) -> pb::TriangleMesh {
-    let own;
-    let mesh = match shape.shown() {
-        Some(shown) => &shown.mesh,
-        None => {
-            let told = shape.told();
-            let corners = |triangle: &[u32; 3], uv: &[[f32; 2]]| triangle.map(|vertex| uv[vertex as usize]);
-            own = TriangleMesh {
-                vertices_m: shape.vertices_m().to_vec(),
-                triangles: shape.triangles().to_vec(),
-                uv: told.uv.as_ref().map(|uv| shape.triangles().iter().map(|of| corners(of, uv)).collect()),
-                groups: told.groups.clone(),
-            };
-            &own
-        }
-    };
+/// Returns the mesh of a scene as a message.
+fn mesh(mesh: &TriangleMesh) -> pb::TriangleMesh {
     let group = |group: &Group| pb::Group { name: group.name.clone(), vertices: group.vertices.clone() };
     pb::TriangleMesh {
         vertices_m: mesh.vertices_m.iter().flat_map(DVec3::to_array).collect(),
@@ -94,7 +79,7 @@ fn from_mesh(message: &pb::TriangleMesh, limits: &Limits) -> Result<TriangleMesh
 
 /// Returns the scene with which a session began, as three parts of a header.
 pub(super) fn scene(scene: &Scene) -> (palpate_proto::pb::Scene, Option<pb::TriangleMesh>, pb::Appearance) {
-    let mesh = scene.mesh().map(|of_mesh| mesh(&of_mesh.shape));
+    let mesh = scene.body.kind().mesh().as_ref().map(mesh);
     let Appearance { texture, surface, texture_seed, texture_size } = &scene.appearance;
     let appearance = pb::Appearance {
         texture: texture.as_ref().map(|path| path.display().to_string()).unwrap_or_default(),
@@ -131,8 +116,8 @@ pub fn check_replays(header: &pb::Header) -> Result<()> {
 pub fn model(header: &pb::Header, given: &Limits) -> Result<Arc<Model>> {
     let limits = limits(given);
     let message = required("scene", header.scene.as_ref())?;
-    let on_mesh = header.mesh.as_ref().map(|mesh| from_mesh(mesh, &limits)).transpose()?;
-    let mut scene = from_scene(message, on_mesh.as_ref()).map_err(|refusal| refusal.within("scene"))?;
+    let beside = header.mesh.as_ref().map(|mesh| from_mesh(mesh, &limits)).transpose()?;
+    let mut scene = from_scene(message, beside.as_ref()).map_err(|refusal| refusal.within("scene"))?;
     if let Some(appearance) = &header.appearance {
         scene.appearance = from_appearance(appearance)?;
     }

@@ -1,5 +1,5 @@
-//! The vertices of a mesh as frames show them, in an order that keeps neighbours together. If a coarser mesh is
-//! simulated than the file has, each vertex of the file moves with a place on that one.
+//! The vertices of a tissue's surface as frames show them, in an order that keeps neighbours together. If the simulated
+//! points are not these vertices, as on a mesh coarser than its file, each vertex moves with a place among them.
 
 use std::sync::Arc;
 
@@ -8,29 +8,28 @@ use palpate_geometry::Group;
 
 use palpate_tissue::Model;
 use palpate_tissue::memory;
-use palpate_tissue::scene::{BoundPlace, MeshShape};
-use palpate_tissue::shape::RestShape;
+use palpate_tissue::shape::{BoundPlace, PointId, RestShape, ShownShape};
 
 /// Name of the skin's tables in messages.
 const TABLES: &str = "the shown surface of a mesh";
 
-/// Surface by which frames show a tissue on a mesh: the vertices of the mesh file, their order in a frame, and how
-/// they move with the simulated vertices, which may be fewer. Vertices are numbered as in the file.
-#[derive(Debug, PartialEq)]
+/// Surface by which frames show a tissue whose points are no grid: its vertices, their order in a frame, and how they move
+/// with the simulated points, which may be fewer. Vertices of a mesh are numbered as in its file.
+#[derive(Debug)]
 pub struct Skin {
-    shape: Arc<MeshShape>,
+    shape: Arc<dyn RestShape>,
     /// The vertex at each place of a frame, and the place of each vertex.
     vertices: Vec<u32>,
     places: Vec<u32>,
-    /// Texture coordinates of each vertex, if the file has them.
+    /// Texture coordinates of each vertex, if the surface has them.
     uv: Option<Vec<[f32; 2]>>,
-    /// If another mesh is simulated: how each place of a frame moves with it. Otherwise empty.
+    /// If the vertices are not the points: how each place of a frame moves with these. Otherwise empty.
     bound: Vec<SkinVertex>,
-    /// Rest positions of that mesh's vertices, in the order of memory, m.
+    /// Rest positions of the points then, in the order of memory, m.
     rest_m: Vec<DVec3>,
 }
 
-/// A vertex that moves with a triangle of the simulated mesh.
+/// A vertex that moves with a triangle of points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SkinVertex {
     /// Slots of the triangle's corners in memory.
@@ -40,39 +39,41 @@ struct SkinVertex {
 }
 
 impl Skin {
-    /// Creates the skin of a tissue on a mesh; `None` for a sheet. It unwinds with a refusal if there is no memory
-    /// for its tables (`palpate_tissue::memory`).
+    /// Creates the skin of a tissue; `None` if its points are a grid, which needs none. It unwinds with a refusal if there
+    /// is no memory for its tables (`palpate_tissue::memory`).
     pub fn of(model: &Model) -> Option<Arc<Self>> {
-        let (mesh, [order, slot_of]) = model.scene.mesh().zip(model.shown_order())?;
-        let shape = mesh.shape.clone();
-        let Some(shown) = shape.shown() else {
-            let (vertices, places) = (order.to_vec(), slot_of.to_vec());
-            let uv = shape.told().uv.clone();
+        let [order, place_of] = model.shown_order()?;
+        let shape = model.scene.shared_shape();
+        let shown = shape.shown_surface()?;
+        let uv = shape.shown_uv();
+        if shown.bound.is_empty() {
+            let (vertices, places) = (order.to_vec(), place_of.to_vec());
             return Some(Arc::new(Skin { vertices, places, uv, bound: Vec::new(), rest_m: Vec::new(), shape }));
-        };
-        let corners =
-            |place: &BoundPlace| shape.triangles()[place.triangle as usize].map(|vertex| slot_of[vertex as usize]);
+        }
+        let triangles = shape.triangles();
+        let corners = |place: &BoundPlace| triangles[place.triangle as usize].map(|point| place_of[point as usize]);
         // Vertices that move with neighbouring triangles are shown side by side.
-        let count = shown.places.len();
+        let count = shown.bound.len();
         #[allow(clippy::cast_possible_truncation)]
         let mut vertices: Vec<u32> = memory::collected(0..count as u32, TABLES);
-        vertices.sort_by_key(|vertex| (corners(&shown.places[*vertex as usize]).iter().min().copied(), *vertex));
+        vertices.sort_by_key(|vertex| (corners(&shown.bound[*vertex as usize]).iter().min().copied(), *vertex));
         let mut places: Vec<u32> = memory::zeroed(count, TABLES);
         for (place, vertex) in (0..).zip(&vertices) {
             places[*vertex as usize] = place;
         }
         let bound = vertices.iter().map(|vertex| {
-            let place = &shown.places[*vertex as usize];
+            let place = &shown.bound[*vertex as usize];
             SkinVertex { corners: corners(place), weights: place.barycentric, height_m: place.height_m }
         });
         let bound = memory::collected(bound, TABLES);
-        let rest_m = memory::collected(order.iter().map(|vertex| shape.vertices_m()[*vertex as usize]), TABLES);
-        let uv = shown.mesh.uv.as_ref().map(|_| {
-            let mut of_vertex = memory::filled(count, [0.0; 2], TABLES);
-            shown.mesh.write_vertex_uv(&mut of_vertex);
-            of_vertex
-        });
+        let rest_m = order.iter().map(|point| shape.rest_m(PointId::new(*point as usize)));
+        let rest_m = memory::collected(rest_m, TABLES);
         Some(Arc::new(Skin { vertices, places, uv, bound, rest_m, shape }))
+    }
+
+    /// Returns the shown surface at rest.
+    fn surface(&self) -> ShownShape<'_> {
+        self.shape.shown_surface().unwrap_or_default()
     }
 
     /// Returns the number of the vertex at each place of a frame: place p is row p/[`MESH_ROW`](super::MESH_ROW) and
@@ -81,35 +82,33 @@ impl Skin {
         &self.vertices
     }
 
-    /// Returns the place in a frame of each vertex of the file: the inverse of [`Skin::vertices`].
+    /// Returns the place in a frame of each vertex: the inverse of [`Skin::vertices`].
     pub fn places(&self) -> &[u32] {
         &self.places
     }
 
-    /// Returns the rest position of a vertex of the file, m, in the tissue's frame. Panics if the file has no such
-    /// vertex.
+    /// Returns the rest position of a vertex, m, in the tissue's frame. Panics if there is no such vertex.
     pub fn rest_m(&self, vertex: u32) -> DVec3 {
-        let own = self.shape.shown().map_or(self.shape.vertices_m(), |shown| &shown.mesh.vertices_m);
-        own[vertex as usize]
+        self.surface().vertices_m[vertex as usize]
     }
 
-    /// Returns the triangles of the file, each as three of its vertices, anticlockwise seen from outside.
+    /// Returns the triangles, each as three vertices, anticlockwise seen from outside.
     pub fn triangles(&self) -> &[[u32; 3]] {
-        self.shape.shown().map_or(self.shape.triangles(), |shown| &shown.mesh.triangles)
+        self.surface().triangles
     }
 
-    /// Returns the named groups of the file's vertices; empty if it has none.
+    /// Returns the named groups of vertices; empty if there are none.
     pub fn groups(&self) -> &[Group] {
-        self.shape.shown().map_or(&self.shape.told().groups, |shown| &shown.mesh.groups)
+        self.surface().groups
     }
 
-    /// Returns the texture coordinates of a vertex of the file; `None` if the file has none. Panics if it has
+    /// Returns the texture coordinates of a vertex; `None` if the surface has none. Panics if it has
     /// coordinates but no such vertex.
     pub fn texture_at(&self, vertex: u32) -> Option<[f32; 2]> {
         self.uv.as_ref().map(|uv| uv[vertex as usize])
     }
 
-    /// Returns the usual length of an edge of the simulated mesh, m; the file may have shorter edges.
+    /// Returns the usual distance of neighbouring points, m; shown vertices may be closer.
     pub fn edge_m(&self) -> f64 {
         self.shape.edge_m()
     }
@@ -145,5 +144,16 @@ impl Skin {
             }
         }
         shown_m
+    }
+}
+
+impl PartialEq for Skin {
+    fn eq(&self, other: &Self) -> bool {
+        // `places` and `rest_m` follow from these.
+        std::ptr::eq(self, other)
+            || self.surface() == other.surface()
+                && self.vertices == other.vertices
+                && self.bound == other.bound
+                && self.uv == other.uv
     }
 }

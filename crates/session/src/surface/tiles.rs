@@ -84,7 +84,7 @@ impl Area {
     }
 
     /// Returns the tile's points within those of a whole sheet.
-    fn of_sheet<'v>(&self, snapshot: &'v Snapshot) -> Points<'v> {
+    fn of_grid<'v>(&self, snapshot: &'v Snapshot) -> Points<'v> {
         let Points { values, stride, .. } = snapshot.points();
         let from = self.first_point[0] * stride + self.first_point[1];
         Points { values: values.map(|values| &values[from..]), stride, count: self.points }
@@ -99,7 +99,7 @@ impl Tile {
     /// Returns the displacements from which it was last written.
     fn shown<'v>(&'v self, key: &'v Snapshot) -> Points<'v> {
         match &self.own {
-            None => self.area.of_sheet(key),
+            None => self.area.of_grid(key),
             Some(own) => {
                 let [_, stride] = self.area.points;
                 Points { values: own.each_ref().map(Vec::as_slice), stride, count: self.area.points }
@@ -184,7 +184,7 @@ impl FrameTiles {
         let unseen_m = self.quanta.unseen_m(self.encoding);
         let width = Width::widest();
         for tile in &mut self.tiles {
-            let (now, shown, mut moved) = (tile.area.of_sheet(snapshot), tile.shown(&self.key), false);
+            let (now, shown, mut moved) = (tile.area.of_grid(snapshot), tile.shown(&self.key), false);
             width.run(Compare { now, shown, unseen_m, moved: &mut moved });
             if moved {
                 tile.take(now, self.version);

@@ -6,10 +6,11 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_geometry::TriangleMesh;
 use palpate_proto::geometry::{from_point, from_vector, point, vector};
-use palpate_proto::pb;
+use palpate_proto::{pb, scene};
 
 use super::required;
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
+use palpate_tissue::scene::sent::{self, MeshFile};
 use palpate_tissue::scene::{
     Appearance, Body, Change, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named,
     PointSet, Precision, Region, Scene, Sheet, Simulated, Springs, Stepping, Substance, Volume,
@@ -255,6 +256,64 @@ pub fn sent(scene: &Scene) -> pb::Scene {
         }
     }
     message
+}
+
+/// The file of a mesh that a client sends before a scene.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MeshToSend {
+    /// The name of the file, whose ending tells its format.
+    pub name: String,
+    /// The content of the file.
+    pub bytes: Vec<u8>,
+    /// The name of its unit of length, or that length in m.
+    pub unit: String,
+}
+
+/// A scene as a client sends it, and the mesh to send before it.
+#[derive(Debug, Clone)]
+pub struct SceneToSend {
+    message: pb::Scene,
+    /// The mesh, if one belongs to the scene.
+    pub upload: Option<MeshToSend>,
+}
+
+impl SceneToSend {
+    /// Converts a scene. `said` is what its text says about its mesh ([`sent::said`]), if that is known. The mesh is that
+    /// of `file`, or is written anew if there is none.
+    pub fn of(scene: &Scene, said: Option<&MeshFile>, file: Option<MeshToSend>) -> Self {
+        let mut message = self::sent(scene);
+        // The number of vertices that the text asks for: the mesh may have fewer.
+        if let (Some(said), Some(of_scene)) = (said, &mut message.mesh) {
+            of_scene.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
+        }
+        let upload = scene.mesh().map(|mesh| {
+            file.unwrap_or_else(|| {
+                let (name, bytes, unit) = sent::file(mesh);
+                MeshToSend { name: name.to_owned(), bytes, unit: unit.to_owned() }
+            })
+        });
+        SceneToSend { message, upload }
+    }
+
+    /// Returns the message, with the ID that the server gave the mesh; empty without a mesh.
+    pub fn with_mesh_id(&self, id: String) -> pb::Scene {
+        let mut message = self.message.clone();
+        scene::set_mesh_id(&mut message, id);
+        message
+    }
+}
+
+/// Returns the scene that a server has told, of a session on a mesh that was fetched from it: `mesh` has all vertices of
+/// its file, and all points and springs have the reference values.
+///
+/// # Errors
+/// Refuses what [`from_scene`] refuses.
+pub fn from_told(message: &pb::Scene, mesh: &TriangleMesh) -> Result<Scene> {
+    // The coefficients that follow from a material are sent as well.
+    let mut even = pb::Scene { material: None, inclusions: Vec::new(), ..message.clone() };
+    // Scripts name the vertices of the file. Only the server knows which point of a coarser mesh each one belongs to.
+    even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
+    from_scene(&even, Some(mesh))
 }
 
 /// Returns a scene as a message, with all defaults filled in and the coefficients that follow from a material. The

@@ -15,16 +15,11 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::body::disc::Disc;
+use crate::body::disc_on;
 use crate::body::model::Model;
-use crate::body::sheet::footprint::GridDisc;
-use crate::body::surface::footprint::MeshDisc;
-use crate::saved::{SavedGeometry, ensure, unsound};
-use crate::scene::Body;
+use crate::saved::{SavedPlace, ensure};
 use palpate_refusal::Result;
-
-/// Smallest movement of a disc on a mesh, as a part of its radius. Computing its weights costs as much as
-/// stepping some thousand points, and the disc is at most this far from the tool's place.
-const MIN_PART: f64 = 1e-6;
 
 /// The smallest part of a disc that movable points carry. Near fixed points they would otherwise have to move
 /// farther than the tool by one over their part, and the stiffness would grow with its square.
@@ -35,10 +30,10 @@ const FIXED_PART: f64 = 0.02;
 
 /// The disc with which a tool touches a tissue, at a place of the tissue at rest: the points that it covers and their
 /// weights. It belongs to the model that it was created for; its functions must get the same.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Footprint {
     radius_m: f64,
-    ground: FootprintGeometry,
+    disc: Box<dyn Disc>,
     reached: Vec<WeightedNode>,
     /// Factor of the weights of movable points ([`MIN_FREE_PART`]).
     free_factor: f64,
@@ -49,11 +44,10 @@ pub struct Footprint {
     relative_inverse_mass: f64,
 }
 
-/// The geometry that the disc lies on.
-#[derive(Debug, Clone)]
-enum FootprintGeometry {
-    Grid(GridDisc),
-    Mesh(Box<MeshDisc>),
+impl Clone for Footprint {
+    fn clone(&self) -> Self {
+        Footprint { disc: self.disc.boxed(), reached: self.reached.clone(), ..*self }
+    }
 }
 
 /// A mass point that a disc covers, and its part of the disc.
@@ -76,71 +70,42 @@ impl Footprint {
     /// Creates a disc of `radius_m` (m) around the place of the rest surface nearest to `at_m` (m, in the tissue's
     /// frame); on a sheet, the place above or below it.
     pub fn new(model: &Model, radius_m: f64, at_m: DVec3) -> Self {
-        let ground = match &model.scene.body {
-            Body::Sheet(sheet) => FootprintGeometry::Grid(GridDisc::new(sheet, radius_m)),
-            Body::Mesh(mesh) => FootprintGeometry::Mesh(Box::new(MeshDisc::new(&mesh.shape, radius_m))),
-        };
-        let mut footprint = Footprint {
+        let mut footprint = Self::unplaced(model, radius_m);
+        footprint.move_to(model, at_m);
+        footprint
+    }
+
+    /// Creates a disc that covers nothing yet.
+    fn unplaced(model: &Model, radius_m: f64) -> Self {
+        Footprint {
             radius_m,
-            ground,
+            disc: disc_on(&model.scene.body, radius_m),
             reached: Vec::new(),
             free_factor: 1.0,
             rest_m: DVec3::ZERO,
             along: [DVec3::X, DVec3::Y],
             relative_inverse_mass: 0.0,
-        };
-        footprint.move_to(model, at_m);
-        footprint
+        }
     }
 
     /// Returns the place of the disc as plain data.
-    pub(crate) fn saved(&self) -> SavedGeometry {
-        match &self.ground {
-            FootprintGeometry::Grid(disc) => SavedGeometry::Grid(disc.centre_m.to_array()),
-            FootprintGeometry::Mesh(disc) => disc.saved(),
-        }
+    pub(crate) fn saved(&self) -> SavedPlace {
+        self.disc.saved()
     }
 
     /// Restores a disc of `radius_m` at a saved place.
-    pub(crate) fn restored(model: &Model, radius_m: f64, saved: &SavedGeometry) -> Result<Self> {
-        match (saved, &model.scene.body) {
-            (SavedGeometry::Grid(centre_m), Body::Sheet(sheet)) => {
-                let centre_m = DVec2::from(*centre_m);
-                let is_on_it = centre_m.cmpge(DVec2::ZERO).all() && centre_m.cmple(sheet.extent_m()).all();
-                ensure(is_on_it, "a tool that is not on the tissue")?;
-                Ok(Footprint::new(model, radius_m, centre_m.extend(0.0)))
-            }
-            (SavedGeometry::Mesh { .. }, Body::Mesh(mesh)) => {
-                let mut disc = MeshDisc::new(&mesh.shape, radius_m);
-                disc.restore(saved)?;
-                let mut footprint = Footprint {
-                    radius_m,
-                    ground: FootprintGeometry::Mesh(Box::new(disc)),
-                    reached: Vec::new(),
-                    free_factor: 1.0,
-                    rest_m: DVec3::ZERO,
-                    along: [DVec3::X, DVec3::Y],
-                    relative_inverse_mass: 0.0,
-                };
-                footprint.lay(model);
-                ensure(footprint.is_sound(), "a tool that is nowhere on the tissue")?;
-                Ok(footprint)
-            }
-            _ => Err(unsound("a tool on a tissue of another kind")),
-        }
+    pub(crate) fn restored(model: &Model, radius_m: f64, saved: &SavedPlace) -> Result<Self> {
+        let mut footprint = Self::unplaced(model, radius_m);
+        footprint.disc.restore(saved)?;
+        footprint.lay(model);
+        ensure(footprint.is_sound(), "a tool that is nowhere on the tissue")?;
+        Ok(footprint)
     }
 
     /// Moves the disc back to an earlier place ([`Footprint::saved`]).
-    pub(crate) fn return_to(&mut self, model: &Model, place: &SavedGeometry) {
-        match (&mut self.ground, place) {
-            (FootprintGeometry::Grid(_), SavedGeometry::Grid(centre_m)) => {
-                self.move_on_grid(model, DVec2::from(*centre_m));
-            }
-            (FootprintGeometry::Mesh(disc), SavedGeometry::Mesh { .. }) => {
-                disc.go_to(place);
-                self.lay(model);
-            }
-            _ => {}
+    pub(crate) fn return_to(&mut self, model: &Model, place: &SavedPlace) {
+        if self.disc.return_to(place) {
+            self.lay(model);
         }
     }
 
@@ -157,63 +122,41 @@ impl Footprint {
 
     /// Returns the rest position of the place of the tissue at the centre of the disc, m.
     pub fn anchor_m(&self) -> DVec3 {
-        match &self.ground {
-            FootprintGeometry::Grid(disc) => disc.centre_m.extend(0.0),
-            FootprintGeometry::Mesh(disc) => disc.anchor_m(),
-        }
+        self.disc.anchor_m()
     }
 
     /// Moves the disc to another place of the tissue: the place of the rest surface nearest to `at_m`, m. Computes the
     /// covered points and their weights anew.
     pub fn move_to(&mut self, model: &Model, at_m: DVec3) {
-        match &mut self.ground {
-            FootprintGeometry::Grid(_) => self.move_on_grid(model, at_m.truncate()),
-            FootprintGeometry::Mesh(disc) => {
-                disc.put(at_m);
-                self.lay(model);
-            }
+        if self.disc.put(at_m) {
+            self.lay(model);
         }
     }
 
     /// Moves the disc by `beside_m`, a vector along the displaced surface. `along` is the derivative of the
     /// surface by the place ([`Footprint::surface`]).
     pub(crate) fn shift(&mut self, model: &Model, beside_m: DVec3, along: &[DVec3; 2]) {
-        match &mut self.ground {
-            FootprintGeometry::Grid(disc) => {
-                let centre_m = disc.centre_m + within(beside_m, along);
-                self.move_on_grid(model, centre_m);
-            }
-            FootprintGeometry::Mesh(disc) => {
-                let by_m = within(beside_m, along);
-                if by_m.length() > MIN_PART * self.radius_m {
-                    disc.walk(by_m);
-                    self.lay(model);
-                }
-            }
+        if self.disc.walk(within(beside_m, along)) {
+            self.lay(model);
         }
     }
 
-    /// Returns how far a touching disc may move at once, m. On a sheet there is no bound, because it is a plane
-    /// at rest.
+    /// Returns how far a touching disc may move at once, m. On a flat tissue there is no bound.
     pub(crate) fn stride_m(&self) -> f64 {
-        match &self.ground {
-            FootprintGeometry::Grid(_) => f64::INFINITY,
-            FootprintGeometry::Mesh(disc) => disc.stride_m(),
-        }
+        self.disc.stride_m()
     }
 
     /// Moves the disc of a tool that touches nothing to the place of the displaced surface nearest to
     /// `place_m`, or towards it. This converges if the surface is not folded.
     pub(crate) fn seek(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
-        if let FootprintGeometry::Mesh(disc) = &mut self.ground
-            && disc.leap(model, place_m, &displacement_m)
-        {
+        let of_point = |point| displacement_m(model.point_of(model.place_of(point)));
+        if self.disc.leap(place_m, &of_point) {
             self.lay(model);
         }
         for _ in 0..2 {
             let (surface_m, along) = self.surface(&displacement_m);
             let mut beside_m = place_m - surface_m;
-            if matches!(self.ground, FootprintGeometry::Mesh(_)) {
+            if !self.disc.is_flat() {
                 let outward = self.outward(&along);
                 let away_m = beside_m.dot(outward).abs();
                 beside_m -= beside_m.dot(outward) * outward;
@@ -224,31 +167,25 @@ impl Footprint {
         }
     }
 
-    fn move_on_grid(&mut self, model: &Model, centre_m: DVec2) {
-        let Footprint { ground: FootprintGeometry::Grid(disc), reached, rest_m, along, .. } = self else { return };
-        let Some(sheet) = model.scene.sheet() else { return };
-        let Some(covered) = disc.move_to(sheet, centre_m) else { return };
-        reached.clear();
-        reached.extend(covered.map(|(point, weight, gradient)| {
-            let free = is_free(model, model.index_of(point));
-            WeightedNode { point, free, mass: 1.0, weight, gradient }
-        }));
-        (*rest_m, *along) = (disc.centre_m.extend(0.0), [DVec3::X, DVec3::Y]);
-        self.weigh(model);
-    }
-
-    /// Takes over the vertices that the disc covers on a mesh.
+    /// Takes over the points that the disc covers.
     fn lay(&mut self, model: &Model) {
-        let (FootprintGeometry::Mesh(disc), Some(graph)) = (&mut self.ground, model.places.surface()) else { return };
-        self.reached.clear();
-        (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
-        for (vertex, weight, gradient, at_m) in disc.cover() {
-            let index = graph.slot_of(vertex);
+        let Footprint { disc, reached, rest_m, along, .. } = self;
+        let is_flat = disc.is_flat();
+        reached.clear();
+        (*rest_m, *along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
+        disc.cover(&mut |point, weight, gradient| {
+            let index = model.place_of(point);
             let (free, mass) = (is_free(model, index), model.relative_mass_at(index));
-            self.reached.push(WeightedNode { point: model.point_of(index), free, mass, weight, gradient });
-            self.rest_m += weight * at_m;
-            self.along[0] += gradient.x * at_m;
-            self.along[1] += gradient.y * at_m;
+            reached.push(WeightedNode { point: model.point_of(index), free, mass, weight, gradient });
+            if !is_flat {
+                let at_m = model.shape().rest_m(point);
+                *rest_m += weight * at_m;
+                along[0] += gradient.x * at_m;
+                along[1] += gradient.y * at_m;
+            }
+        });
+        if is_flat {
+            (*rest_m, *along) = (disc.anchor_m(), [DVec3::X, DVec3::Y]);
         }
         self.weigh(model);
     }
@@ -310,14 +247,13 @@ impl Footprint {
     /// Returns the weight w of a point; 0 for a point that the disc does not cover. It does not search all
     /// covered points: a tip may be as large as the tissue, and this is called for each of its points.
     pub(crate) fn weight_of(&self, model: &Model, index: usize) -> f64 {
-        match &self.ground {
-            FootprintGeometry::Grid(_) => {
-                // They are sorted by rows.
+        match self.disc.weight_of(model.point_at(index)) {
+            // Only called for movable points.
+            Some(weight) => self.free_factor * weight,
+            None => {
                 let found = self.reached.binary_search_by_key(&model.point_of(index), |reached| reached.point);
                 found.map_or(0.0, |place| self.reached[place].weight)
             }
-            // Only called for movable points.
-            FootprintGeometry::Mesh(disc) => self.free_factor * disc.weight_of(model.point_at(index)),
         }
     }
 
@@ -348,39 +284,36 @@ impl Footprint {
     }
 
     /// Returns the surface at rest around the disc, as seen by a tool on this side of it (1 outside, -1
-    /// inside); `None` on a sheet, which is a plane.
+    /// inside); `None` on a flat tissue.
     pub(crate) fn rest_surface(&self, side: f64) -> Option<RestSurface> {
-        let FootprintGeometry::Mesh(disc) = &self.ground else { return None };
-        let (normal, curvature_per_m) = (side * self.outward(&self.along), side * disc.curvature_per_m());
+        if self.disc.is_flat() {
+            return None;
+        }
+        let (normal, curvature_per_m) = (side * self.outward(&self.along), side * self.disc.curvature_per_m());
         Some(RestSurface { place_m: self.rest_m, normal, curvature_per_m })
     }
 
     /// Returns the unit normal out of the tissue. ∂s/∂c₁ × ∂s/∂c₂ is the only choice whose work equals the
     /// energy that the tissue gains when the disc slides over a slope.
     pub(crate) fn outward(&self, along: &[DVec3; 2]) -> DVec3 {
-        along[0].cross(along[1]).try_normalize().unwrap_or_else(|| match &self.ground {
-            FootprintGeometry::Grid(_) => DVec3::Z,
-            FootprintGeometry::Mesh(disc) => disc.outward(),
-        })
+        along[0].cross(along[1]).try_normalize().unwrap_or_else(|| self.disc.outward())
     }
 
     /// Returns whether a tool whose gap from the disc is `gap_m` is beside the tissue: farther off its edge
     /// than the radius.
     pub(crate) fn is_beside(&self, gap_m: DVec3, outward: DVec3) -> bool {
-        let across_m = match &self.ground {
-            FootprintGeometry::Grid(_) => gap_m.truncate().length(),
-            FootprintGeometry::Mesh(_) => (gap_m - gap_m.dot(outward) * outward).length(),
+        let across_m = if self.disc.is_flat() {
+            gap_m.truncate().length()
+        } else {
+            (gap_m - gap_m.dot(outward) * outward).length()
         };
         across_m > self.radius_m
     }
 
     /// Returns the side of the surface of a newly placed tool that is `height_m` above the surface: 1 outside,
-    /// -1 inside. A tool below a sheet presses on it from above.
+    /// -1 inside. A tool below a flat tissue presses on it from above.
     pub(crate) fn side(&self, height_m: f64) -> f64 {
-        match &self.ground {
-            FootprintGeometry::Grid(_) => 1.0,
-            FootprintGeometry::Mesh(disc) => disc.side(height_m),
-        }
+        self.disc.side(height_m)
     }
 }
 

@@ -2,6 +2,7 @@
 //! over the springs, and the contact of a disc with it.
 
 mod advance;
+pub(crate) mod disc;
 pub(crate) mod footprint;
 pub(crate) mod force_field;
 pub mod model;
@@ -19,11 +20,23 @@ use glam::DVec3;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::Width;
 use crate::kernel::real::Real;
+use crate::scene::graph::GraphFault;
 use crate::scene::profile::Poke;
 use crate::scene::{Body, Scene, Sheet};
-use crate::shape::{self, PointId, RestShape};
+use crate::shape::{self, PointId};
+use disc::Disc;
 use sheet::falloff::SheetPoints;
-use surface::{GraphFault, MeshPlaces, VolumePlaces};
+use sheet::footprint::GridDisc;
+use surface::footprint::MeshDisc;
+use surface::{MeshPlaces, VolumePlaces};
+
+/// Returns a disc of `radius_m` (m) on a tissue, at an arbitrary place: the list of the kinds' discs.
+pub(crate) fn disc_on(body: &Body, radius_m: f64) -> Box<dyn Disc> {
+    match body {
+        Body::Sheet(sheet) => Box::new(GridDisc::new(sheet, radius_m)),
+        Body::Mesh(mesh) => Box::new(MeshDisc::new(&mesh.shape, radius_m)),
+    }
+}
 
 /// The points of a scene in memory.
 pub(crate) struct MemoryLayout {
@@ -39,7 +52,7 @@ pub(crate) struct MemoryLayout {
 pub(crate) enum Places {
     /// The points of a sheet are in memory in their order, and alike.
     Sheet(SheetPoints),
-    /// The points of a mesh, and its springs.
+    /// Points in any arrangement, as of a mesh, and their springs.
     Surface(Arc<MeshPlaces>),
 }
 
@@ -47,22 +60,19 @@ impl MemoryLayout {
     /// Lays out the points of a scene.
     ///
     /// # Errors
-    /// Returns the fault of a mesh whose springs can't be laid out.
+    /// Returns the fault of springs that can't be laid out.
     pub(crate) fn of(scene: &Scene) -> Result<Self, GraphFault> {
-        Ok(match &scene.body {
-            Body::Sheet(sheet) => {
-                let Sheet { points, spacing_m, .. } = *sheet;
-                let places = Places::Sheet(SheetPoints { points, spacing_m });
-                MemoryLayout { points, fixed: sheet.fixed_indices(), places }
-            }
-            Body::Mesh(mesh) => {
-                let places = MeshPlaces::of(mesh)?;
-                let points = shape::points(&*mesh.shape).filter(|point| mesh.shape.is_fixed(*point));
-                let mut fixed: Vec<usize> = points.map(|point| places.slot_of(point)).collect();
-                fixed.sort_unstable();
-                MemoryLayout { points: [places.rows(), BLOCK], fixed, places: Places::Surface(Arc::new(places)) }
-            }
-        })
+        if let Body::Sheet(sheet) = &scene.body {
+            let Sheet { points, spacing_m, .. } = *sheet;
+            let places = Places::Sheet(SheetPoints { points, spacing_m });
+            return Ok(MemoryLayout { points, fixed: sheet.fixed_indices(), places });
+        }
+        let (kind, shape) = (scene.body.kind(), scene.shape());
+        let places = MeshPlaces::of(kind, &kind.graph())?;
+        let points = shape::points(shape).filter(|point| shape.is_fixed(*point));
+        let mut fixed: Vec<usize> = points.map(|point| places.slot_of(point)).collect();
+        fixed.sort_unstable();
+        Ok(MemoryLayout { points: [places.rows(), BLOCK], fixed, places: Places::Surface(Arc::new(places)) })
     }
 }
 
@@ -167,12 +177,9 @@ impl Places {
         }
     }
 
-    /// Adds what tells the tissue of `scene` from another with the same coefficients to the bytes of its identity: its
-    /// kind, and on a mesh also points, order in memory and springs.
+    /// Adds what tells the tissue of `scene` from another with the same coefficients to the bytes of its identity.
     pub(crate) fn identify(&self, scene: &Scene, add: &mut impl FnMut(&[u8])) {
-        match (&scene.body, self) {
-            (Body::Mesh(mesh), Places::Surface(places)) => surface::identify(mesh, places, add),
-            _ => add(b"sheet"),
-        }
+        let order = self.surface().map_or(&[][..], |places| places.slots.vertex_of());
+        scene.body.kind().identify(order, add);
     }
 }

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use crate::body::MemoryLayout;
 use crate::body::Places;
-use crate::body::surface::GraphFault;
 use crate::kernel::field::{BLOCK, Layout};
+use crate::scene::graph::GraphFault;
 use crate::scene::{Integrator, Lanes, Precision, Scene};
 use crate::scheme::stability;
 use crate::scheme::{Oscillator, QuadratureNode, Relaxation, Scheme};
@@ -135,7 +135,7 @@ impl Model {
     /// sleeps.
     ///
     /// # Errors
-    /// Returns the fault of a mesh whose springs can't be laid out.
+    /// Returns the fault of springs that can't be laid out.
     pub(crate) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
         let MemoryLayout { points, fixed, places } = MemoryLayout::of(&scene)?;
         Ok(Model {

@@ -45,10 +45,10 @@ pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result
 /// tip, m.
 ///
 /// # Errors
-/// Refuses a length that is not finite, or above the limit `reach_in_sheets` times the tissue's longest side
+/// Refuses a length that is not finite, or above the limit `reach_in_sides` times the tissue's longest side
 /// ([`Reason::OutOfRange`]); `field` is the key that the refusal gives.
 pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
-    let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
+    let limit_m = shape.longest_side_m() * limits.reach_in_sides;
     let range = format!("at most {} m from the rest position", legible(limit_m));
     number(field, displacement_m, &range, |v| v <= limit_m).map_err(in_millimetres(displacement_m, limit_m))?;
     Ok(())

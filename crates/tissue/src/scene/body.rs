@@ -1,10 +1,16 @@
-//! What every kind of tissue answers about its points: where they rest, what they weigh, and how fast they vibrate.
+//! What every kind of tissue answers: how its section is read, where its points rest, what they weigh, and how fast they
+//! vibrate.
 
 use std::fmt;
 use std::sync::Arc;
 
+use palpate_geometry::TriangleMesh;
+
+use super::graph::MeshGraph;
 use super::profile::Poke;
+use super::source::Files;
 use super::springs::Springs;
+use super::toml_document::Fields;
 use super::volume::Volume;
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
@@ -39,11 +45,43 @@ const MUCH_FASTER: f64 = 2.5;
 /// The bound of the stiffness of a mesh whose points are all alike, divided by k.
 const EVEN: f64 = 12.0;
 
+/// A kind of tissue in the text of scenes, and in parts. The list of kinds in the module `scene` calls it.
+pub(super) trait KindOfBody: BodyKind + Sized {
+    /// The name of the section of a scene that describes the points.
+    const SECTION: &'static str;
+
+    /// Reads the section. `of_material` says that a section `[material]` gives the masses.
+    ///
+    /// # Errors
+    /// Refuses keys and values that the section can't have.
+    fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self>;
+
+    /// Reads the section `[springs]`; may change the tissue, which has just been read. By default there is one k.
+    ///
+    /// # Errors
+    /// Refuses keys and values that the springs of this kind can't have.
+    fn read_springs(&mut self, fields: &mut Fields<'_>) -> Result<Springs> {
+        Ok(Springs::alike(fields.required_number("stiffness_n_per_m")?))
+    }
+
+    /// Returns a small part of the tissue that vibrates as fast as the whole, and three points of it
+    /// ([`Body::part`](super::Body::part)).
+    fn part(&self, side: usize) -> (Self, [PointId; 3]);
+
+    /// Returns the same tissue with points `spacing_m` (m) apart ([`Body::coarser`](super::Body::coarser)).
+    fn coarser(&self, _spacing_m: f64, _half_m: f64) -> Option<(Self, f64)> {
+        None
+    }
+}
+
 /// A kind of tissue, as a scene describes it. [`Body::kind`](super::Body::kind) gives that of a scene; nothing else
 /// needs to know which kind it is. Stiffnesses are those of a scene: k of its springs, and K″ of its anchor springs.
 pub trait BodyKind: fmt::Debug + Send + Sync {
     /// Returns the name of the section of a scene that describes the points.
     fn section(&self) -> &'static str;
+
+    /// Returns the key of the scene that a refusal names for the number of points, and for what is wrong with all of them.
+    fn points_key(&self) -> &'static str;
 
     /// Returns which key of the section gives the unit of length, as a sentence for people who may have missed it.
     fn unit_hint(&self) -> &'static str;
@@ -69,6 +107,24 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
     fn relative_anchor_stiffness(&self, _point: PointId) -> f64 {
         1.0
     }
+
+    /// Returns the triangle mesh that belongs to a scene besides its text, as its file or its client gave it: clients
+    /// upload it, and journals keep it. `None` if the text describes the whole tissue.
+    fn mesh(&self) -> Option<TriangleMesh> {
+        None
+    }
+
+    /// Returns the points and their springs, with k relative to that of the scene, for a kind whose points may be in any
+    /// arrangement. The default has no point, which is refused: a kind in rows and columns has a layout of its own in the
+    /// module `body` of the tissue.
+    fn graph(&self) -> MeshGraph {
+        MeshGraph::default()
+    }
+
+    /// Adds what tells this tissue from another of the same kind with the same coefficients to the bytes of its identity,
+    /// beginning with the name of the kind. `order` has the number of the point at each place in memory, or of none;
+    /// empty if the points are in memory in their order.
+    fn identify(&self, order: &[u32], add: &mut dyn FnMut(&[u8]));
 
     /// Returns the volume that the tissue encloses, if its pressure counts.
     fn volume(&self) -> Option<&Volume> {

@@ -16,12 +16,14 @@ use super::source::{Files, SourceMesh};
 use super::springs::Springs;
 use super::volume::{Swelling, Volume};
 use crate::limits::Limits;
+use crate::memory;
 use crate::scene::action_check::physical;
-use crate::scene::body::{BodyKind, StiffnessBound};
+use crate::scene::body::{BodyKind, KindOfBody, StiffnessBound};
+use crate::scene::graph::{MeshGraph, MeshSpring};
 use crate::scene::profile::Poke;
 use crate::scene::toml_document::{Fields, Item};
-use crate::shape::{Deepest, Extent, PointId, PointName, RestShape};
-use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
+use crate::shape::{Deepest, Extent, PointId, PointName, RestShape, ShownShape};
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, number, positive};
 
 mod indentation;
 mod tool_depth;
@@ -49,6 +51,8 @@ pub struct Mesh {
     pub stiffest: StiffnessBound,
     /// The enclosed volume, if it resists changes (section `[volume]`, [`Mesh::enclosing`]); otherwise `None`.
     pub volume: Option<Arc<Volume>>,
+    /// Whether a movable point has no anchor, whatever K″ is: then nothing bounds how far a small force moves it.
+    has_free_point: bool,
 }
 
 /// Masses and stiffnesses of single points and springs, relative to the reference values of the scene. A list
@@ -112,39 +116,8 @@ impl Mesh {
     /// Message of the refusal of a point mass beside a material ([`Reason::WrongKind`]).
     pub const WEIGHED: &str = "does not go with [material], which says what a point weighs";
 
-    /// Reads the section `[mesh]`. `of_material` says that a section `[material]` gives the masses; then the
-    /// edges are flipped to Delaunay.
-    pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self> {
-        let (source_mesh, source) = files.mesh(fields, limits)?;
-        let point_mass_kg = match fields.item("point_mass_kg") {
-            Some(mass) if of_material => {
-                return Err(mass.refuse(Reason::WrongKind, Self::WEIGHED));
-            }
-            Some(mass) => mass.number()?,
-            None if of_material => 1.0,
-            None => fields.required_number("point_mass_kg")?,
-        };
-        let vertices = match fields.item("vertices") {
-            Some(item) => {
-                let least = |vertices: &usize| *vertices >= MIN_VERTICES;
-                let vertices = usize::try_from(item.whole()?).ok().filter(least);
-                let message = format!("must be at least {MIN_VERTICES}");
-                Some(vertices.ok_or_else(|| item.refuse(Reason::OutOfRange, message))?)
-            }
-            None => None,
-        };
-        let simulated = match source_mesh {
-            SourceMesh::Made(mesh) => Simulated::made(mesh, vertices, of_material),
-            SourceMesh::Read(mesh) => Simulated::of(mesh, vertices, of_material).map_err(|refusal| {
-                let name = source.as_text().map_or_else(String::new, |file| format!("{file}: "));
-                source.refuse(refusal.reason, format!("{name}{}", refusal.message))
-            })?,
-        };
-        let fixed =
-            fields.item("fixed").map_or(Ok(FixedVertices::None), |item| FixedVertices::read(&item, &simulated.mesh))?;
-        let made = Self::simulating(simulated, point_mass_kg, fixed);
-        made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
-    }
+    /// Message of the refusal of shear springs ([`Reason::WrongKind`]).
+    pub const NO_SHEAR: &str = "is for sheets: the edges of a mesh resist shear as well";
 
     /// Creates a tissue on a mesh, m, with equal springs along its edges, without bending springs, volume and
     /// shown mesh. `point_mass_kg` is the mass of each point, kg, which is not checked.
@@ -210,7 +183,10 @@ impl Mesh {
     pub fn uneven(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>, differences: PerNodeFactors) -> Self {
         let stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor: 0.0 };
         let differences = Arc::new(differences);
-        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None };
+        let is_free =
+            |(vertex, extra): (usize, &f64)| *extra <= -1.0 && shape.is_used(vertex) && !shape.is_fixed[vertex];
+        let has_free_point = differences.extra_anchor.iter().enumerate().any(is_free);
+        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None, has_free_point };
         mesh.stiffest = mesh.find_stiffest();
         mesh
     }
@@ -243,63 +219,6 @@ impl Mesh {
         let bending: &[[u32; 2]] = if part > 0.0 { &shape.opposite } else { &[] };
         let along = shape.edges.iter().enumerate().map(move |(which, ends)| (*ends, of(edges, which)));
         along.chain(bending.iter().enumerate().map(move |(which, ends)| (*ends, part * of(bending_factors, which))))
-    }
-
-    /// Returns a part of at most `most` vertices around the one that moves most in the fastest vibration,
-    /// turned so that its normal is along z. Also returns three of its points: that vertex, one about half way
-    /// to the rim of the part, and one at the rim.
-    #[allow(clippy::cast_possible_truncation)]
-    pub(super) fn part(&self, most: usize) -> (Self, [PointId; 3]) {
-        let shape = &self.shape;
-        let (first, count) = (self.stiffest.vertex as usize, shape.vertices_m.len());
-        let mut number_of = vec![u32::MAX; count];
-        let mut found = vec![first];
-        number_of[first] = 0;
-        let mut next = 0;
-        while next < found.len() && found.len() < most {
-            for vertex in shape.neighbours.of(found[next]) {
-                if found.len() < most && number_of[*vertex as usize] == u32::MAX {
-                    number_of[*vertex as usize] = found.len() as u32;
-                    found.push(*vertex as usize);
-                }
-            }
-            next += 1;
-        }
-        let turn = DQuat::from_rotation_arc(shape.normals[first], DVec3::Z);
-        let vertices_m =
-            found.iter().map(|vertex| turn * (shape.vertices_m[*vertex] - shape.vertices_m[first])).collect();
-        let numbered = shape.triangles.iter().map(|triangle| triangle.map(|vertex| number_of[vertex as usize]));
-        let triangles: Vec<_> = numbered.filter(|triangle| triangle.iter().all(|vertex| *vertex != u32::MAX)).collect();
-        let is_fixed = |_: bool, _: DVec3, vertex: u32| vertex != 0 && shape.is_fixed[found[vertex as usize]];
-        let looked_at = [0, found.len() / 4, found.len() - 1].map(PointId::new);
-        match MeshShape::new(vertices_m, triangles, is_fixed) {
-            Ok(part) => {
-                let known = &self.differences;
-                let of_points =
-                    |list: &[f64]| if list.is_empty() { vec![] } else { found.iter().map(|of| list[*of]).collect() };
-                let of_springs = |list: &[f64], all: &[[u32; 2]], ends: &[[u32; 2]]| -> Vec<f64> {
-                    let of = |ends: &[u32; 2]| {
-                        let [a, b] = ends.map(|end| found[end as usize] as u32);
-                        all.binary_search(&[a.min(b), a.max(b)]).map_or(1.0, |at| list[at])
-                    };
-                    if list.is_empty() { vec![] } else { ends.iter().map(of).collect() }
-                };
-                let differences = PerNodeFactors {
-                    relative_mass: of_points(&known.relative_mass),
-                    extra_anchor: of_points(&known.extra_anchor),
-                    edges: of_springs(&known.edges, &shape.edges, &part.edges),
-                    bending: of_springs(&known.bending, &shape.opposite, &part.opposite),
-                };
-                let mut part = Mesh::uneven(self.point_mass_kg, self.bending, Arc::new(part), differences);
-                part.volume = self.volume.as_ref().and_then(|volume| {
-                    let areas_m2 = found.iter().map(|vertex| turn * volume.areas_m2[*vertex]).collect();
-                    volume.part(areas_m2, |vertex| part.relative_mass(PointId::new(vertex))).map(Arc::new)
-                });
-                (part, looked_at)
-            }
-            // Parts of a mesh that is sound are sound.
-            Err(_) => (self.clone(), [PointId::new(first); 3]),
-        }
     }
 
     /// Finds an upper bound of the stiffness and the vertex where it is largest.
@@ -370,11 +289,170 @@ impl Mesh {
         }
         stiffest
     }
+
+    /// Returns a part of at most `most` vertices around the one that moves most in the fastest vibration,
+    /// turned so that its normal is along z. Also returns three of its points: that vertex, one about half way
+    /// to the rim of the part, and one at the rim.
+    #[allow(clippy::cast_possible_truncation)]
+    fn part_around_fastest(&self, most: usize) -> (Self, [PointId; 3]) {
+        let shape = &self.shape;
+        let (first, count) = (self.stiffest.vertex as usize, shape.vertices_m.len());
+        let mut number_of = vec![u32::MAX; count];
+        let mut found = vec![first];
+        number_of[first] = 0;
+        let mut next = 0;
+        while next < found.len() && found.len() < most {
+            for vertex in shape.neighbours.of(found[next]) {
+                if found.len() < most && number_of[*vertex as usize] == u32::MAX {
+                    number_of[*vertex as usize] = found.len() as u32;
+                    found.push(*vertex as usize);
+                }
+            }
+            next += 1;
+        }
+        let turn = DQuat::from_rotation_arc(shape.normals[first], DVec3::Z);
+        let vertices_m =
+            found.iter().map(|vertex| turn * (shape.vertices_m[*vertex] - shape.vertices_m[first])).collect();
+        let numbered = shape.triangles.iter().map(|triangle| triangle.map(|vertex| number_of[vertex as usize]));
+        let triangles: Vec<_> = numbered.filter(|triangle| triangle.iter().all(|vertex| *vertex != u32::MAX)).collect();
+        let is_fixed = |_: bool, _: DVec3, vertex: u32| vertex != 0 && shape.is_fixed[found[vertex as usize]];
+        let looked_at = [0, found.len() / 4, found.len() - 1].map(PointId::new);
+        match MeshShape::new(vertices_m, triangles, is_fixed) {
+            Ok(part) => {
+                let known = &self.differences;
+                let of_points =
+                    |list: &[f64]| if list.is_empty() { vec![] } else { found.iter().map(|of| list[*of]).collect() };
+                let of_springs = |list: &[f64], all: &[[u32; 2]], ends: &[[u32; 2]]| -> Vec<f64> {
+                    let of = |ends: &[u32; 2]| {
+                        let [a, b] = ends.map(|end| found[end as usize] as u32);
+                        all.binary_search(&[a.min(b), a.max(b)]).map_or(1.0, |at| list[at])
+                    };
+                    if list.is_empty() { vec![] } else { ends.iter().map(of).collect() }
+                };
+                let differences = PerNodeFactors {
+                    relative_mass: of_points(&known.relative_mass),
+                    extra_anchor: of_points(&known.extra_anchor),
+                    edges: of_springs(&known.edges, &shape.edges, &part.edges),
+                    bending: of_springs(&known.bending, &shape.opposite, &part.opposite),
+                };
+                let mut part = Mesh::uneven(self.point_mass_kg, self.bending, Arc::new(part), differences);
+                part.volume = self.volume.as_ref().and_then(|volume| {
+                    let areas_m2 = found.iter().map(|vertex| turn * volume.areas_m2[*vertex]).collect();
+                    volume.part(areas_m2, |vertex| part.relative_mass(PointId::new(vertex))).map(Arc::new)
+                });
+                (part, looked_at)
+            }
+            // Parts of a mesh that is sound are sound.
+            Err(_) => (self.clone(), [PointId::new(first); 3]),
+        }
+    }
+}
+
+impl KindOfBody for Mesh {
+    const SECTION: &'static str = "mesh";
+
+    /// With a material, the edges are flipped to Delaunay.
+    fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self> {
+        let (source_mesh, source) = files.mesh(fields, limits)?;
+        let point_mass_kg = match fields.item("point_mass_kg") {
+            Some(mass) if of_material => {
+                return Err(mass.refuse(Reason::WrongKind, Self::WEIGHED));
+            }
+            Some(mass) => mass.number()?,
+            None if of_material => 1.0,
+            None => fields.required_number("point_mass_kg")?,
+        };
+        let vertices = match fields.item("vertices") {
+            Some(item) => {
+                let least = |vertices: &usize| *vertices >= MIN_VERTICES;
+                let vertices = usize::try_from(item.whole()?).ok().filter(least);
+                let message = format!("must be at least {MIN_VERTICES}");
+                Some(vertices.ok_or_else(|| item.refuse(Reason::OutOfRange, message))?)
+            }
+            None => None,
+        };
+        let simulated = match source_mesh {
+            SourceMesh::Made(mesh) => Simulated::made(mesh, vertices, of_material),
+            SourceMesh::Read(mesh) => Simulated::of(mesh, vertices, of_material).map_err(|refusal| {
+                let name = source.as_text().map_or_else(String::new, |file| format!("{file}: "));
+                source.refuse(refusal.reason, format!("{name}{}", refusal.message))
+            })?,
+        };
+        let fixed =
+            fields.item("fixed").map_or(Ok(FixedVertices::None), |item| FixedVertices::read(&item, &simulated.mesh))?;
+        let made = Self::simulating(simulated, point_mass_kg, fixed);
+        made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
+    }
+
+    /// Reads springs along the edges and, if wanted, bending springs.
+    fn read_springs(&mut self, fields: &mut Fields<'_>) -> Result<Springs> {
+        let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+        if let Some(shear) = fields.item("shear_stiffness_n_per_m") {
+            return Err(shear.refuse(Reason::WrongKind, Self::NO_SHEAR));
+        }
+        if let Some(item) = fields.item("bending") {
+            *self = Mesh::new(self.point_mass_kg, read_bending(&item)?, self.shape.clone());
+        }
+        Ok(Springs::alike(stiffness_n_per_m))
+    }
+
+    fn part(&self, side: usize) -> (Self, [PointId; 3]) {
+        self.part_around_fastest(side * side)
+    }
 }
 
 impl BodyKind for Mesh {
     fn section(&self) -> &'static str {
-        "mesh"
+        Self::SECTION
+    }
+
+    fn points_key(&self) -> &'static str {
+        "mesh.file"
+    }
+
+    fn mesh(&self) -> Option<TriangleMesh> {
+        if let Some(shown) = &self.shape.shown {
+            return Some(shown.mesh.clone());
+        }
+        let MeshShape { vertices_m, triangles, told, .. } = &*self.shape;
+        let corners = |triangle: &[u32; 3], uv: &[[f32; 2]]| triangle.map(|vertex| uv[vertex as usize]);
+        Some(TriangleMesh {
+            vertices_m: vertices_m.clone(),
+            triangles: triangles.clone(),
+            uv: told.uv.as_ref().map(|uv| triangles.iter().map(|of| corners(of, uv)).collect()),
+            groups: told.groups.clone(),
+        })
+    }
+
+    fn graph(&self) -> MeshGraph {
+        let springs = self.springs();
+        MeshGraph {
+            rest_m: self.shape.vertices_m.clone(),
+            springs: springs.map(|(ends, stiffness_n_per_m)| MeshSpring { ends, stiffness_n_per_m }).collect(),
+            spacing_m: self.shape.edge_m,
+            relative_mass: self.differences.relative_mass.clone(),
+            extra_anchor: self.differences.extra_anchor.clone(),
+        }
+    }
+
+    /// Adds bounds and factors, the points in the order of the mesh and of memory, and the springs.
+    fn identify(&self, order: &[u32], add: &mut dyn FnMut(&[u8])) {
+        add(b"mesh");
+        let mut numbers = |values: &[f64]| {
+            add(&(values.len() as u64).to_le_bytes());
+            values.iter().for_each(|value| add(&value.to_bits().to_le_bytes()));
+        };
+        numbers(&[self.stiffest.bound, self.stiffest.usual]);
+        numbers(&self.differences.relative_mass);
+        numbers(&self.differences.extra_anchor);
+        self.shape.vertices_m.iter().for_each(|vertex_m| numbers(&vertex_m.to_array()));
+        for corner in self.shape.triangles.iter().flatten().chain(order) {
+            add(&corner.to_le_bytes());
+        }
+        for (ends, stiffness_n_per_m) in self.springs() {
+            ends.iter().for_each(|end| add(&end.to_le_bytes()));
+            add(&stiffness_n_per_m.to_bits().to_le_bytes());
+        }
     }
 
     fn unit_hint(&self) -> &'static str {
@@ -405,6 +483,12 @@ impl BodyKind for Mesh {
 
     fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
         self.relative_mass(point) * (1.0 + self.extra_anchor(point))
+    }
+
+    /// Returns 0 if a movable point has no anchor: the springs to its neighbours resist a movement across them only as
+    /// it stretches them.
+    fn restoring_n_per_m(&self, anchor_n_per_m: f64) -> f64 {
+        if self.has_free_point { 0.0 } else { anchor_n_per_m }
     }
 
     fn volume(&self) -> Option<&Volume> {
@@ -494,12 +578,18 @@ impl BodyKind for Mesh {
         let count = self.shape.point_count();
         if count > limits.points {
             let message = format!("has {count} vertices, above the limit of {} points in all", limits.points);
-            return Err(Refusal::new(Reason::TooLarge, "mesh.file", message));
+            return Err(Refusal::new(Reason::TooLarge, self.points_key(), message));
         }
         physical("mesh.point_mass_kg", positive("mesh.point_mass_kg", self.point_mass_kg)?)?;
         physical("mesh.unit", self.shape.edge_m)?;
         Ok(())
     }
+}
+
+/// Reads `springs.bending` of a mesh: k of the bending springs relative to that of the edges.
+pub(super) fn read_bending(item: &Item<'_>) -> Result<f64> {
+    let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
+    number("springs.bending", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
 }
 
 /// Smallest distance from the surface at rest at which a new tool begins, m.
@@ -885,8 +975,30 @@ impl RestShape for MeshShape {
         MeshShape::triangles(self).to_vec()
     }
 
-    fn shown_count(&self) -> usize {
-        self.shown().map_or(self.point_count(), |shown| shown.places.len())
+    fn shown_surface(&self) -> Option<ShownShape<'_>> {
+        Some(match &self.shown {
+            None => ShownShape {
+                vertices_m: &self.vertices_m,
+                triangles: &self.triangles,
+                groups: &self.told.groups,
+                bound: &[],
+            },
+            Some(Shown { mesh, places, .. }) => ShownShape {
+                vertices_m: &mesh.vertices_m,
+                triangles: &mesh.triangles,
+                groups: &mesh.groups,
+                bound: places,
+            },
+        })
+    }
+
+    fn shown_uv(&self) -> Option<Vec<[f32; 2]>> {
+        let Some(Shown { mesh, .. }) = &self.shown else { return self.told.uv.clone() };
+        mesh.uv.as_ref().map(|_| {
+            let mut of_vertex = memory::filled(mesh.vertices_m.len(), [0.0; 2], "the texture coordinates of a mesh");
+            mesh.write_vertex_uv(&mut of_vertex);
+            of_vertex
+        })
     }
 
     fn deepest(&self, way_m: &[DVec3], radius_m: f64) -> Option<Deepest> {
@@ -1237,10 +1349,10 @@ mod tests {
     #[test]
     fn a_part_of_a_mesh_is_turned_and_has_its_springs() {
         let mesh = Mesh::new(0.1, 0.5, Arc::new(shape()));
-        let (part, [pushed, ..]) = mesh.part(3);
+        let (part, [pushed, ..]) = mesh.part_around_fastest(3);
         assert_eq!((part.shape.vertices_m.len(), part.shape.edges.len()), (3, 3));
         assert!(part.shape.rest_m(pushed).length() < 1e-12 && !part.shape.is_fixed(pushed));
-        let (all, _) = mesh.part(100);
+        let (all, _) = mesh.part_around_fastest(100);
         assert_eq!(all.shape.vertices_m.len(), 4, "what is not joined does not belong to it");
         assert!(all.shape.normal(pushed).distance(DVec3::Z) < 1e-9);
     }

@@ -6,6 +6,7 @@ pub mod action_check;
 mod body;
 pub mod collection;
 mod eigenvalue;
+pub mod graph;
 pub mod kind;
 mod material;
 mod membrane;
@@ -31,13 +32,15 @@ use crate::files;
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use action_check::physical;
+use body::KindOfBody;
 pub use body::{BodyKind, StiffnessBound};
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
+use mesh::read_bending;
 pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
-pub use shown::{BoundPlace, Shown, Simulated};
+pub use shown::{Shown, Simulated};
 use source::Files;
 pub use springs::Springs;
 use toml_document::{Document, Fields, Item};
@@ -113,53 +116,79 @@ pub struct Scene {
     pub appearance: Appearance,
 }
 
-/// The mass points of a tissue, where they rest and how they are joined: a sheet or a mesh. [`Scene::shape`]
-/// gives both as one trait.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Body {
-    /// A rectangular grid.
-    Sheet(Sheet),
-    /// The surface of a triangle mesh.
-    Mesh(Mesh),
+/// Writes [`Body`] and what it asks of each kind, from one list: a kind of tissue is a line there.
+macro_rules! kinds {
+    ($($(#[$of_kind:meta])* $Kind:ident,)+) => {
+        /// The mass points of a tissue, where they rest and how they are joined. [`Body::kind`] answers for every kind;
+        /// [`Scene::shape`] gives the points.
+        #[derive(Debug, Clone, PartialEq)]
+        pub enum Body {
+            $($(#[$of_kind])* $Kind($Kind),)+
+        }
+
+        impl Body {
+            /// The sections that describe the points of a tissue, one for each kind.
+            pub(crate) const SECTIONS: &'static [&'static str] = &[$($Kind::SECTION),+];
+
+            /// Returns what every kind of tissue answers.
+            pub fn kind(&self) -> &dyn BodyKind {
+                match self {
+                    $(Body::$Kind(kind) => kind,)+
+                }
+            }
+
+            /// Reads a section, of which the document has one: see [`KindOfBody::read`].
+            fn read(
+                section: &str,
+                fields: &mut Fields<'_>,
+                files: Files<'_>,
+                of_material: bool,
+                limits: &Limits,
+            ) -> Result<Self> {
+                match section {
+                    $($Kind::SECTION => $Kind::read(fields, files, of_material, limits).map(Body::$Kind),)+
+                    _ => Err(fields.refuse(Reason::UnknownKey, "", "is not a kind of tissue")),
+                }
+            }
+
+            /// Reads the section `[springs]`.
+            fn read_springs(&mut self, fields: &mut Fields<'_>) -> Result<Springs> {
+                match self {
+                    $(Body::$Kind(kind) => kind.read_springs(fields),)+
+                }
+            }
+
+            /// Returns a small part of the tissue that vibrates as fast as the whole, for test runs: at most `side`²
+            /// points, not all of them fixed. `side` is at least 1. Also returns three points of the part, in its own
+            /// numbers, to push or to watch; the first one is free to move, and they may coincide.
+            pub fn part(&self, side: usize) -> (Body, [PointId; 3]) {
+                match self {
+                    $(Body::$Kind(kind) => {
+                        let (part, points) = kind.part(side);
+                        (Body::$Kind(part), points)
+                    })+
+                }
+            }
+
+            /// Returns the same tissue with points `spacing_m` (m) apart, each of which replaces several, and the number
+            /// of points that one replaces. It reaches `half_m` (m) from the middle, where it is held, or is the whole
+            /// tissue if that is not larger. `None` if the tissue is not uniform ([`RestShape::is_uniform`]).
+            pub fn coarser(&self, spacing_m: f64, half_m: f64) -> Option<(Body, f64)> {
+                match self {
+                    $(Body::$Kind(kind) => {
+                        kind.coarser(spacing_m, half_m).map(|(coarse, replaced)| (Body::$Kind(coarse), replaced))
+                    })+
+                }
+            }
+        }
+    };
 }
 
-impl Body {
-    /// Returns what every kind of tissue answers.
-    pub fn kind(&self) -> &dyn BodyKind {
-        match self {
-            Body::Sheet(sheet) => sheet,
-            Body::Mesh(mesh) => mesh,
-        }
-    }
-
-    /// Returns a small part of the tissue that vibrates as fast as the whole, for test runs: at most `side`²
-    /// points, not all of them fixed. `side` is at least 1. Also returns three points of the part, in its own
-    /// numbers, to push or to watch; the first one is free to move, and they may coincide.
-    pub fn part(&self, side: usize) -> (Body, [PointId; 3]) {
-        match self {
-            Body::Sheet(sheet) => {
-                let (part, points) = sheet.part(side);
-                (Body::Sheet(part), points)
-            }
-            Body::Mesh(mesh) => {
-                let (part, points) = mesh.part(side * side);
-                (Body::Mesh(part), points)
-            }
-        }
-    }
-
-    /// Returns the same tissue with points `spacing_m` (m) apart, each of which replaces several, and the number of
-    /// points that one replaces. It reaches `half_m` (m) from the middle, where it is held, or is the whole tissue if
-    /// that is not larger. `None` if the tissue is not uniform ([`RestShape::is_uniform`]).
-    pub fn coarser(&self, spacing_m: f64, half_m: f64) -> Option<(Body, f64)> {
-        match self {
-            Body::Sheet(sheet) => {
-                let (coarse, replaced) = sheet.coarser(spacing_m, half_m);
-                Some((Body::Sheet(coarse), replaced))
-            }
-            Body::Mesh(_) => None,
-        }
-    }
+kinds! {
+    /// A rectangular grid.
+    Sheet,
+    /// The surface of a triangle mesh.
+    Mesh,
 }
 
 /// Smallest side of a generated texture: 16 pixels. The largest is the limit `texture_side`.
@@ -482,28 +511,19 @@ impl Scene {
 
     /// Returns the grid, borrowed; `None` if the tissue is a mesh.
     pub fn sheet(&self) -> Option<&Sheet> {
-        match &self.body {
-            Body::Sheet(sheet) => Some(sheet),
-            Body::Mesh(_) => None,
-        }
+        if let Body::Sheet(sheet) = &self.body { Some(sheet) } else { None }
     }
 
     /// Returns the grid, mutable; `None` if the tissue is a mesh. Check the scene after changing it
     /// ([`Scene::check`]).
     pub fn sheet_mut(&mut self) -> Option<&mut Sheet> {
-        match &mut self.body {
-            Body::Sheet(sheet) => Some(sheet),
-            Body::Mesh(_) => None,
-        }
+        if let Body::Sheet(sheet) = &mut self.body { Some(sheet) } else { None }
     }
 
     /// Returns the triangle mesh that belongs to the scene besides its text: clients upload it, journals and other
     /// servers keep it, and frames show it. `None` if the text describes the whole tissue.
     pub fn mesh(&self) -> Option<&Mesh> {
-        match &self.body {
-            Body::Sheet(_) => None,
-            Body::Mesh(mesh) => Some(mesh),
-        }
+        if let Body::Mesh(mesh) = &self.body { Some(mesh) } else { None }
     }
 
     /// Returns the volume that a mesh encloses; `None` if the scene has no `[volume]`, as on any sheet.
@@ -628,7 +648,7 @@ impl Substance {
             body: Body::Mesh(made.mesh),
             material: Some(material),
             inclusions: Arc::default(),
-            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false },
+            springs: Springs::alike(stiffness_n_per_m),
             anchor_stiffness_n_per_m: made.anchor_stiffness_n_per_m,
             damping_n_s_per_m: made.damping_n_s_per_m,
             volume_stiffness_pa: 0.0,
@@ -658,36 +678,34 @@ impl Substance {
     pub fn enclosing(mut self, stiffness_pa: f64) -> Result<Self> {
         physical("volume.stiffness_pa", positive("volume.stiffness_pa", stiffness_pa)?)?;
         self.volume_stiffness_pa = stiffness_pa;
-        self.body = match self.body {
-            Body::Mesh(mesh) => Body::Mesh(mesh.enclosing()?),
-            Body::Sheet(_) => return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH)),
+        let Body::Mesh(mesh) = self.body else {
+            return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH));
         };
-        Ok(self)
+        Ok(Substance { body: Body::Mesh(mesh.enclosing()?), ..self })
     }
 }
 
-/// Reads the section `[sheet]` or `[mesh]`, and the sections that give stiffness, mass and damping.
+/// Reads the section of the kind of tissue, and the sections that give stiffness, mass and damping.
 fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Substance> {
-    let (sheet, mesh) = (fields.item("sheet"), fields.item("mesh"));
+    let mut given = Body::SECTIONS.iter().filter_map(|section| Some((*section, fields.item(section)?)));
+    let (first, second) = (given.next(), given.next());
     let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
-    match (&sheet, &mesh) {
-        (Some(_), Some(mesh)) => {
-            return Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"));
-        }
-        (_, None) => {
-            if let Some(item) = material.or(inclusions) {
-                return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
-            }
-            if let Some(item) = volume {
-                return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
-            }
-            let body = Body::Sheet(fields.required("sheet")?.table(Sheet::read)?);
-            return read_coefficients(fields, body);
-        }
-        (None, Some(_)) => {}
-    }
     let of_material = material.is_some();
-    let mesh = fields.required("mesh")?.table(|fields| Mesh::read(fields, files, of_material, limits))?;
+    if let (Some((section, _)), Some((_, other))) = (&first, &second) {
+        let message = format!("does not go with [{section}]: a tissue is one of them");
+        return Err(other.refuse(Reason::WrongKind, message));
+    }
+    let section = first.map_or(Body::SECTIONS[0], |(section, _)| section);
+    if section != Mesh::SECTION {
+        if let Some(item) = material.as_ref().or(inclusions.as_ref()) {
+            return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
+        }
+        if let Some(item) = volume {
+            return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
+        }
+    }
+    let body = fields.required(section)?.table(|fields| Body::read(section, fields, files, of_material, limits))?;
+    let Body::Mesh(mesh) = body else { return read_coefficients(fields, body) };
     if mesh.shape.point_count() > limits.points {
         mesh.check(limits)?;
     }
@@ -709,7 +727,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
 /// Reads the sections that give the coefficients directly, as in the paper.
 fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substance> {
     Ok(Substance {
-        springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
+        springs: fields.required("springs")?.table(|fields| body.read_springs(fields))?,
         body,
         material: None,
         inclusions: Arc::default(),
@@ -742,34 +760,6 @@ fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Resul
         })?,
     };
     Substance::of_material(material, bending, mesh.shape.clone())
-}
-
-/// Reads `springs.bending` of a mesh: k of the bending springs relative to that of the edges.
-fn read_bending(item: &Item<'_>) -> Result<f64> {
-    let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
-    number("springs.bending", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
-}
-
-/// Reads the section `[springs]`. A mesh has springs along its edges and, if wanted, bending springs.
-fn read_springs(fields: &mut Fields<'_>, body: &mut Body) -> Result<Springs> {
-    let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
-    let (shear, bending) = (fields.item("shear_stiffness_n_per_m"), fields.item("bending"));
-    match body {
-        Body::Sheet(_) => Ok(Springs {
-            stiffness_n_per_m,
-            shear_stiffness_n_per_m: shear.map_or(Ok(stiffness_n_per_m), |item| item.number())?,
-            bending: bending.map_or(Ok(false), |item| item.flag())?,
-        }),
-        Body::Mesh(mesh) => {
-            if let Some(shear) = shear {
-                return Err(shear.refuse(Reason::WrongKind, "is for sheets: the edges of a mesh resist shear as well"));
-            }
-            if let Some(item) = bending {
-                *mesh = Mesh::new(mesh.point_mass_kg, read_bending(&item)?, mesh.shape.clone());
-            }
-            Ok(Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false })
-        }
-    }
 }
 
 fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {

@@ -43,7 +43,7 @@ impl Script {
     /// - a duration or sample interval of less than half a step, times that don't ascend, a move shorter than 1
     ///   µs;
     /// - a point or place that is not on the tissue, a fixed or twice grasped point;
-    /// - a force above `limits.point_force_n`, a reach above `limits.reach_in_sheets`, more tools than
+    /// - a force above `limits.point_force_n`, a reach above `limits.reach_in_sides`, more tools than
     ///   `limits.tools`;
     /// - a tip that does not suit the tissue ([`check_tip`]), and a change after which [`Scene::check`] refuses
     ///   the scene;

@@ -8,7 +8,8 @@ use glam::{DVec2, DVec3};
 use crate::limits::Limits;
 use crate::memory;
 use crate::scene::action_check::physical;
-use crate::scene::body::BodyKind;
+use crate::scene::body::{BodyKind, KindOfBody};
+use crate::scene::source::Files;
 use crate::scene::springs::Springs;
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Deepest, Extent, GridCell, PointId, PointName, RestShape};
@@ -84,17 +85,6 @@ impl FixedPoints {
 }
 
 impl Sheet {
-    pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
-        Ok(Sheet {
-            points: fields.required("points")?.point()?,
-            spacing_m: fields.required_number("spacing_m")?,
-            point_mass_kg: fields.required_number("point_mass_kg")?,
-            fixed: fields
-                .item("fixed")
-                .map_or(Ok(FixedPoints::Points(PointSet::default())), |item| FixedPoints::read(&item))?,
-        })
-    }
-
     /// Returns the point [i, j], with the index i·ny + j. It must be on the grid, which isn't checked:
     /// [`RestShape::find`] does.
     pub fn point(&self, [i, j]: [usize; 2]) -> PointId {
@@ -113,9 +103,52 @@ impl Sheet {
         self.spacing_m * DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
 
+    /// Returns the row-major indices i·ny + j of the fixed points, ascending, each once. Without memory for
+    /// them it unwinds with a refusal ([`memory::attempt`]).
+    pub fn fixed_indices(&self) -> Vec<usize> {
+        let [nx, ny] = self.points;
+        let mut indices: Vec<usize> = match &self.fixed {
+            FixedPoints::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
+            _ => {
+                // The rim, at most.
+                let mut indices = memory::with_room((2 * (nx + ny)).min(nx * ny), "the fixed points");
+                indices.extend((0..nx * ny).filter(|index| self.is_fixed(PointId::new(*index))));
+                indices
+            }
+        };
+        indices.sort_unstable();
+        indices.dedup();
+        indices
+    }
+}
+
+impl KindOfBody for Sheet {
+    const SECTION: &'static str = "sheet";
+
+    fn read(fields: &mut Fields<'_>, _: Files<'_>, _: bool, _: &Limits) -> Result<Self> {
+        Ok(Sheet {
+            points: fields.required("points")?.point()?,
+            spacing_m: fields.required_number("spacing_m")?,
+            point_mass_kg: fields.required_number("point_mass_kg")?,
+            fixed: fields
+                .item("fixed")
+                .map_or(Ok(FixedPoints::Points(PointSet::default())), |item| FixedPoints::read(&item))?,
+        })
+    }
+
+    fn read_springs(&mut self, fields: &mut Fields<'_>) -> Result<Springs> {
+        let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+        let (shear, bending) = (fields.item("shear_stiffness_n_per_m"), fields.item("bending"));
+        Ok(Springs {
+            stiffness_n_per_m,
+            shear_stiffness_n_per_m: shear.map_or(Ok(stiffness_n_per_m), |item| item.number())?,
+            bending: bending.map_or(Ok(false), |item| item.flag())?,
+        })
+    }
+
     /// Returns a corner of the grid with at most `side` points along each side. Also returns three of its
     /// points: a free one, its middle, and one at a corner, where there are fewer springs.
-    pub(super) fn part(&self, side: usize) -> (Self, [PointId; 3]) {
+    fn part(&self, side: usize) -> (Self, [PointId; 3]) {
         let points @ [nx, ny] = self.points.map(|points| points.min(side));
         let mut part = Sheet { points, ..self.clone() };
         if let FixedPoints::Points(points) = &mut part.fixed {
@@ -133,7 +166,7 @@ impl Sheet {
     /// one replaces, (`spacing_m`/h)². It reaches `half_m` (m) from the middle, where it is held, or covers the whole
     /// sheet, with its fixed points, if that is not larger.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub(super) fn coarser(&self, spacing_m: f64, half_m: f64) -> (Self, f64) {
+    fn coarser(&self, spacing_m: f64, half_m: f64) -> Option<(Self, f64)> {
         let times = spacing_m / self.spacing_m;
         let is_cut = self.longest_side_m() > 2.0 * half_m;
         // As many on both sides of the middle.
@@ -156,31 +189,21 @@ impl Sheet {
             set => set.clone(),
         };
         let replaced = times * times;
-        (Sheet { points, spacing_m, point_mass_kg: replaced * self.point_mass_kg, fixed }, replaced)
-    }
-
-    /// Returns the row-major indices i·ny + j of the fixed points, ascending, each once. Without memory for
-    /// them it unwinds with a refusal ([`memory::attempt`]).
-    pub fn fixed_indices(&self) -> Vec<usize> {
-        let [nx, ny] = self.points;
-        let mut indices: Vec<usize> = match &self.fixed {
-            FixedPoints::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
-            _ => {
-                // The rim, at most.
-                let mut indices = memory::with_room((2 * (nx + ny)).min(nx * ny), "the fixed points");
-                indices.extend((0..nx * ny).filter(|index| self.is_fixed(PointId::new(*index))));
-                indices
-            }
-        };
-        indices.sort_unstable();
-        indices.dedup();
-        indices
+        Some((Sheet { points, spacing_m, point_mass_kg: replaced * self.point_mass_kg, fixed }, replaced))
     }
 }
 
 impl BodyKind for Sheet {
     fn section(&self) -> &'static str {
-        "sheet"
+        Self::SECTION
+    }
+
+    fn points_key(&self) -> &'static str {
+        "sheet.points"
+    }
+
+    fn identify(&self, _: &[u32], add: &mut dyn FnMut(&[u8])) {
+        add(b"sheet");
     }
 
     fn unit_hint(&self) -> &'static str {
@@ -219,11 +242,11 @@ impl BodyKind for Sheet {
         let [nx, ny] = self.points;
         if nx == 0 || ny == 0 {
             let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
-            return Err(Refusal::new(Reason::OutOfRange, "sheet.points", message));
+            return Err(Refusal::new(Reason::OutOfRange, self.points_key(), message));
         }
         if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
             let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
-            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+            return Err(Refusal::new(Reason::TooLarge, self.points_key(), message));
         }
         // A narrow sheet takes the memory and time of one of this width, which may be sixteen times its own.
         if nx.checked_mul(ny.max(MIN_WIDTH)).is_none_or(|points| points > limits.points) {
@@ -232,7 +255,7 @@ impl BodyKind for Sheet {
                  {nx} × {MIN_WIDTH} are above the limit of {} points in all; give the longer side last",
                 limits.points
             );
-            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+            return Err(Refusal::new(Reason::TooLarge, self.points_key(), message));
         }
         physical("sheet.spacing_m", positive("sheet.spacing_m", self.spacing_m)?)?;
         physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.point_mass_kg)?)?;

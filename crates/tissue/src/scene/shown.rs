@@ -10,6 +10,7 @@ use palpate_geometry::surface::nearest_place;
 use palpate_geometry::work::spend;
 use palpate_geometry::{FileMesh, TriangleMesh, prepare};
 
+use crate::shape::BoundPlace;
 use palpate_refusal::{Reason, Refusal, Result};
 
 /// The mesh of the file, and how its vertices follow the simulated mesh. It exists if the simulated mesh has
@@ -27,19 +28,6 @@ pub struct Shown {
     /// is, and of several equally close ones the first. If there are none, the closest of all that are bound to
     /// one of its triangles.
     pub(super) names: Vec<u32>,
-}
-
-/// A place at a height above a triangle of the simulated mesh. It moves and turns with the triangle: with the
-/// corners a, b, c and the weights u, v, w it is at u·a + v·b + w·c + height·n, n the unit normal.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BoundPlace {
-    /// The number of the triangle of the simulated mesh, from 0.
-    pub triangle: u32,
-    /// Barycentric weights of the triangle's three vertices, in its order; each is at least 0 (but for
-    /// rounding), and their sum is 1.
-    pub barycentric: [f64; 3],
-    /// Height of the place above the triangle at rest, along its normal, m; negative below it.
-    pub height_m: f64,
 }
 
 /// The mesh of a scene as it is simulated, and the mesh that is shown; for

@@ -11,3 +11,10 @@ pub struct Springs {
     /// [`Mesh::bending`](super::Mesh::bending).)
     pub bending: bool,
 }
+
+impl Springs {
+    /// Returns springs that all have the same k, N/m, without bending springs.
+    pub fn alike(stiffness_n_per_m: f64) -> Self {
+        Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false }
+    }
+}

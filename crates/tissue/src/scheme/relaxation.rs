@@ -35,6 +35,16 @@ impl Relaxation {
         self.restoring_n_per_m > 0.0
     }
 
+    /// Returns the restoring stiffness K in the units of a scheme, K·dt²/m, for a substep of `substep_s`, s.
+    pub(crate) fn scaled(&self, substep_s: f64) -> f64 {
+        self.restoring_n_per_m * substep_s * substep_s / self.mass_kg
+    }
+
+    /// Returns √(K/m), rad/s: the slowest vibration without damping. 0 if nothing pulls the tissue back.
+    pub fn slowest_per_s(&self) -> f64 {
+        (self.restoring_n_per_m / self.mass_kg).sqrt()
+    }
+
     /// Returns γ, 1/s: the amplitude of the slowest vibration falls as e^(−γt). 0 if it does not fall.
     ///
     /// For m·ü + C·u̇ + K·u = 0, γ = C/2m, or in the overdamped case γ = (C − √(C² − 4mK))/2m for the slower part.

@@ -286,7 +286,7 @@ impl Tool {
         SavedContact {
             number: self.number as u64,
             tip: SavedTip::of(&self.tip),
-            ground: self.footprint.saved(),
+            place: self.footprint.saved(),
             from_m: self.from_m.into(),
             to_m: self.to_m.into(),
             contact_state: CONTACT_STATES.iter().position(|state| *state == self.contact_state).unwrap_or(0) as u8,
@@ -309,7 +309,7 @@ impl Tool {
         Ok(Tool {
             number: checks.tool(saved.number)?,
             tip,
-            footprint: Footprint::restored(model, tip.radius_m, &saved.ground)?,
+            footprint: Footprint::restored(model, tip.radius_m, &saved.place)?,
             from_m: checks.vector(saved.from_m)?,
             to_m: checks.vector(saved.to_m)?,
             contact_state: contact_state.unwrap_or(ContactState::Free),
@@ -513,7 +513,7 @@ impl Tool {
             (surface_m - 0.5 * movement_m(model, layout, state, footprint), along)
         };
         push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
-        let ((stayed_m, _), ground) = (mean_place(&self.footprint, state), self.footprint.saved());
+        let ((stayed_m, _), place) = (mean_place(&self.footprint, state), self.footprint.saved());
         self.footprint.shift(model, beside_m, &along);
         let (went_m, along) = mean_place(&self.footprint, state);
         let travelled_m = went_m - stayed_m;
@@ -533,7 +533,7 @@ impl Tool {
         // than that path.
         let is_driven = across.dot(travelled_m) < -self.own_movement_m(model, plan).length();
         if !is_straight || is_driven {
-            self.footprint.return_to(model, &ground);
+            self.footprint.return_to(model, &place);
             push(model, plan, layout, state, &self.footprint, self.steady_n, half);
             return Slide::Stays(if is_straight { across_n.normalize_or_zero() } else { DVec3::ZERO });
         }
@@ -549,7 +549,7 @@ impl Tool {
         if pressing_n <= 0.0 {
             // Nothing presses at the new place. All that acts in this substep acts at the old one.
             push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
-            self.footprint.return_to(model, &ground);
+            self.footprint.return_to(model, &place);
             (self.normal, self.offset_m) = stays;
             push(model, plan, layout, state, &self.footprint, self.steady_n, half);
             return Slide::Leaves;

@@ -16,9 +16,13 @@ use std::cell::RefCell;
 use std::f64::consts::TAU;
 use std::sync::OnceLock;
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 
+use crate::body::disc::Disc;
+use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::Sheet;
+use crate::shape::PointId;
+use palpate_refusal::Result;
 
 /// Smallest number of rings in a disc; larger discs have two per spacing.
 const MIN_RINGS: f64 = 6.0;
@@ -44,11 +48,15 @@ const MAX_LAID_OUT: usize = 1 << 14;
 /// The disc of a tool on a sheet, at a place. Lengths in m.
 #[derive(Debug, Clone)]
 pub(crate) struct GridDisc {
+    sheet: Sheet,
     /// Radius of the disc over which the hats are averaged.
     drawn_m: f64,
     /// Sample places of the sum, relative to the centre.
     offsets_m: Vec<DVec2>,
-    pub(crate) centre_m: DVec2,
+    centre_m: DVec2,
+    /// First row and column of the rectangle of these points, and its columns.
+    origin: [usize; 2],
+    columns: usize,
     /// Scratch memory: the sums of each point, by rows.
     sums: Vec<(f64, DVec2)>,
     /// The points of these sums, if the rectangle around them is too large to be stored.
@@ -61,44 +69,43 @@ impl GridDisc {
         let spacing_m = sheet.spacing_m;
         let drawn = drawn_radius(radius_m / spacing_m);
         GridDisc {
+            sheet: sheet.clone(),
             drawn_m: drawn * spacing_m,
             offsets_m: disc(drawn).into_iter().map(|offset| offset * spacing_m).collect(),
             centre_m: DVec2::NAN,
+            origin: [0; 2],
+            columns: 1,
             sums: Vec::new(),
             met: Vec::new(),
         }
     }
 
-    /// Moves the disc to a place, or to the edge of the sheet if the place is beside it. Returns the points
-    /// that it then covers, by rows, with their weights and the derivatives of these by the place, 1/m; `None`
-    /// if it was there already.
-    pub(crate) fn move_to(
-        &mut self,
-        sheet: &Sheet,
-        centre_m: DVec2,
-    ) -> Option<impl Iterator<Item = ([usize; 2], f64, DVec2)>> {
-        let centre_m = centre_m.clamp(DVec2::ZERO, sheet.extent_m());
+    /// Moves the disc to a place, or to the edge of the sheet if the place is beside it, and computes the points that it
+    /// then covers. Returns false if it was there already.
+    fn move_to(&mut self, centre_m: DVec2) -> bool {
+        let centre_m = centre_m.clamp(DVec2::ZERO, self.sheet.extent_m());
         if centre_m == self.centre_m {
-            return None;
+            return false;
         }
         self.centre_m = centre_m;
         let (mut origin, mut size) = ([0; 2], [0; 2]);
         for axis in 0..2 {
-            let (low, _) = cell(sheet, axis, centre_m[axis] - self.drawn_m);
-            let (high, _) = cell(sheet, axis, centre_m[axis] + self.drawn_m);
+            let (low, _) = cell(&self.sheet, axis, centre_m[axis] - self.drawn_m);
+            let (high, _) = cell(&self.sheet, axis, centre_m[axis] + self.drawn_m);
             origin[axis] = low;
-            size[axis] = (high + 2).min(sheet.points[axis]) - low;
+            size[axis] = (high + 2).min(self.sheet.points[axis]) - low;
         }
+        (self.origin, self.columns) = (origin, size[1]);
         self.sums.clear();
         self.met.clear();
         let is_laid_out = size[0].saturating_mul(size[1]) <= MAX_LAID_OUT;
         if is_laid_out {
             self.sums.resize(size[0] * size[1], (0.0, DVec2::ZERO));
         } else {
-            self.intersect(sheet);
+            self.intersect();
             self.sums.resize(self.met.len(), (0.0, DVec2::ZERO));
         }
-        let GridDisc { offsets_m, sums, met, .. } = self;
+        let GridDisc { sheet, offsets_m, sums, met, .. } = self;
         for_each_share(sheet, centre_m, offsets_m, |point, weight, gradient| {
             let [row, column] = [point[0] - origin[0], point[1] - origin[1]];
             // A sheet of one row has no next row.
@@ -111,20 +118,73 @@ impl GridDisc {
                 sum.1 += gradient;
             }
         });
-        let (columns, met) = (size[1], &*met);
+        true
+    }
+
+    /// Returns the points that the disc covers, by rows, with their weights and the derivatives of these by the place,
+    /// 1/m.
+    fn covered(&self) -> impl Iterator<Item = ([usize; 2], f64, DVec2)> {
+        let GridDisc { sums, met, origin, columns, .. } = self;
         let sums = sums.iter().enumerate().filter(|(_, sum)| sum.0 != 0.0);
-        Some(sums.map(move |(at, &(weight, gradient))| {
+        sums.map(move |(at, &(weight, gradient))| {
             let point = met.get(at).copied().unwrap_or([origin[0] + at / columns, origin[1] + at % columns]);
             (point, weight, gradient)
-        }))
+        })
     }
 
     /// Finds the points around the sample places.
-    fn intersect(&mut self, sheet: &Sheet) {
-        let GridDisc { offsets_m, met, centre_m, .. } = self;
+    fn intersect(&mut self) {
+        let GridDisc { sheet, offsets_m, met, centre_m, .. } = self;
         for_each_share(sheet, *centre_m, offsets_m, |point, _, _| met.push(point));
         met.sort_unstable();
         met.dedup();
+    }
+}
+
+/// Returns the place on a plane that a snapshot has.
+fn place_of(saved: &SavedPlace) -> Option<DVec2> {
+    if let SavedPlace::OfPlane(centre_m) = saved { Some(DVec2::from(*centre_m)) } else { None }
+}
+
+impl Disc for GridDisc {
+    fn boxed(&self) -> Box<dyn Disc> {
+        Box::new(self.clone())
+    }
+
+    fn saved(&self) -> SavedPlace {
+        SavedPlace::OfPlane(self.centre_m.to_array())
+    }
+
+    fn restore(&mut self, saved: &SavedPlace) -> Result<()> {
+        let centre_m = place_of(saved).ok_or_else(|| unsound("a tool on a tissue of another kind"))?;
+        let is_on_it = centre_m.cmpge(DVec2::ZERO).all() && centre_m.cmple(self.sheet.extent_m()).all();
+        ensure(is_on_it, "a tool that is not on the tissue")?;
+        self.move_to(centre_m);
+        Ok(())
+    }
+
+    fn return_to(&mut self, saved: &SavedPlace) -> bool {
+        place_of(saved).is_some_and(|centre_m| self.move_to(centre_m))
+    }
+
+    fn anchor_m(&self) -> DVec3 {
+        self.centre_m.extend(0.0)
+    }
+
+    fn put(&mut self, at_m: DVec3) -> bool {
+        self.move_to(at_m.truncate())
+    }
+
+    fn walk(&mut self, by_m: DVec2) -> bool {
+        self.move_to(self.centre_m + by_m)
+    }
+
+    fn is_flat(&self) -> bool {
+        true
+    }
+
+    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2)) {
+        self.covered().for_each(|(point, weight, gradient)| add(self.sheet.point(point), weight, gradient));
     }
 }
 
@@ -343,14 +403,16 @@ mod tests {
         let strip = model("[1, 60000]");
         let (sheet, length_m) = (strip.scene.sheet().unwrap(), strip.shape().longest_side_m());
         let mut disc = GridDisc::new(sheet, 0.5 * length_m);
-        let covered: Vec<_> = disc.move_to(sheet, DVec2::new(0.0, 0.4 * length_m)).unwrap().collect();
+        assert!(disc.move_to(DVec2::new(0.0, 0.4 * length_m)));
+        let covered: Vec<_> = disc.covered().collect();
         let whole: f64 = covered.iter().map(|(_, weight, _)| weight).sum();
         assert!((whole - 1.0).abs() < 1e-9 && covered.len() <= 4096, "{whole} {}", covered.len());
         // What is met is the same as what is laid out.
         let square = model("[160, 300]");
         let sheet = square.scene.sheet().unwrap();
         let (mut disc, centre_m) = (GridDisc::new(sheet, 90.3 * sheet.spacing_m), 80.2 * DVec2::splat(sheet.spacing_m));
-        let covered: Vec<_> = disc.move_to(sheet, centre_m).unwrap().collect();
+        assert!(disc.move_to(centre_m));
+        let covered: Vec<_> = disc.covered().collect();
         assert!(!disc.met.is_empty());
         let mut sums = vec![(0.0, DVec2::ZERO); 162 * 302];
         for_each_share(sheet, centre_m, &disc.offsets_m, |[i, j], weight, gradient| {

@@ -6,8 +6,9 @@ use std::sync::Arc;
 use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
+use crate::body::disc::Disc;
 use crate::body::model::Model;
-use crate::saved::{SavedGeometry, ensure};
+use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::MeshShape;
 use crate::shape::PointId;
 use palpate_refusal::Result;
@@ -16,9 +17,13 @@ use palpate_refusal::Result;
 /// radius, so that it does not jump back and forth between two places.
 const NEARER: f64 = 0.1;
 
-/// Returns the place on a mesh that a snapshot has; `None` for one on a sheet.
-fn place_of(saved: &SavedGeometry) -> Option<Place> {
-    let SavedGeometry::Mesh { triangle, barycentric, frame } = saved else { return None };
+/// Smallest movement of a disc, as a part of its radius. Computing its weights costs as much as stepping some thousand
+/// points, and the disc is at most this far from the tool's place.
+const MIN_PART: f64 = 1e-6;
+
+/// Returns the place on a triangle that a snapshot has.
+fn place_of(saved: &SavedPlace) -> Option<Place> {
+    let SavedPlace::OfTriangle { triangle, barycentric, frame } = saved else { return None };
     Some(Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) })
 }
 
@@ -38,16 +43,20 @@ impl MeshDisc {
         let place = surface.nearest(DVec3::ZERO).unwrap_or(nowhere);
         MeshDisc { shape: shape.clone(), disc: SurfaceDisc::new(radius_m, surface.edge_m()), place }
     }
+}
 
-    /// Returns the place as plain data.
-    pub(crate) fn saved(&self) -> SavedGeometry {
-        let Place { triangle, barycentric, frame } = self.place;
-        SavedGeometry::Mesh { triangle, barycentric, frame: frame.map(Into::into) }
+impl Disc for MeshDisc {
+    fn boxed(&self) -> Box<dyn Disc> {
+        Box::new(self.clone())
     }
 
-    /// Checks a saved place and moves the disc there.
-    pub(crate) fn restore(&mut self, saved: &SavedGeometry) -> Result<()> {
-        let Some(place) = place_of(saved) else { return Ok(()) };
+    fn saved(&self) -> SavedPlace {
+        let Place { triangle, barycentric, frame } = self.place;
+        SavedPlace::OfTriangle { triangle, barycentric, frame: frame.map(Into::into) }
+    }
+
+    fn restore(&mut self, saved: &SavedPlace) -> Result<()> {
+        let place = place_of(saved).ok_or_else(|| unsound("a tool on a tissue of another kind"))?;
         let triangles = self.shape.triangles().len();
         ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue lacks")?;
         let hats = place.barycentric;
@@ -70,62 +79,56 @@ impl MeshDisc {
         Ok(())
     }
 
-    /// Moves the disc back to an earlier place.
-    pub(crate) fn go_to(&mut self, saved: &SavedGeometry) {
-        self.place = place_of(saved).unwrap_or(self.place);
+    fn return_to(&mut self, saved: &SavedPlace) -> bool {
+        let place = place_of(saved);
+        self.place = place.unwrap_or(self.place);
+        place.is_some()
     }
 
-    /// Returns the rest position of the place, m.
-    pub(crate) fn anchor_m(&self) -> DVec3 {
+    fn anchor_m(&self) -> DVec3 {
         self.shape.surface().at_m(&self.place)
     }
 
     /// Returns the outward normal of its triangle at rest.
-    pub(crate) fn outward(&self) -> DVec3 {
+    fn outward(&self) -> DVec3 {
         let [along, across] = self.place.frame;
         along.cross(across)
     }
 
-    /// Returns the change of the outward normal along the surface at rest, 1/m: the mean over the disc.
-    pub(crate) fn curvature_per_m(&self) -> DMat3 {
+    fn curvature_per_m(&self) -> DMat3 {
         let surface = self.shape.surface();
         let of = |covered: &Covered| covered.weight * surface.curvature_per_m(covered.vertex as usize);
         self.disc.covered().iter().map(of).fold(DMat3::ZERO, |sum, part| sum + part)
     }
 
-    /// Returns the side on which a tool is ([`palpate_geometry::surface::Surface::side`]).
-    pub(crate) fn side(&self, height_m: f64) -> f64 {
+    fn side(&self, height_m: f64) -> f64 {
         self.shape.surface().side(height_m, self.disc.radius_m())
     }
 
-    /// Moves the disc to the place of the rest surface nearest to `at_m`.
-    pub(crate) fn put(&mut self, at_m: DVec3) {
+    fn put(&mut self, at_m: DVec3) -> bool {
         self.place = self.shape.surface().nearest(at_m).unwrap_or(self.place);
+        true
     }
 
-    /// Returns how far the disc may move at once, m.
-    pub(crate) fn stride_m(&self) -> f64 {
+    fn stride_m(&self) -> f64 {
         self.disc.stride_m()
     }
 
-    /// Walks over the surface by `by_m` in the directions of the place.
-    pub(crate) fn walk(&mut self, by_m: DVec2) {
-        self.place = self.shape.surface().walk(&self.place, by_m);
+    fn walk(&mut self, by_m: DVec2) -> bool {
+        let moves = by_m.length() > MIN_PART * self.disc.radius_m();
+        if moves {
+            self.place = self.shape.surface().walk(&self.place, by_m);
+        }
+        moves
     }
 
-    /// Moves the disc to the place of the rest surface nearest to `place_m`, if the displaced surface is nearer
-    /// there than at the disc. Returns whether it moved.
-    pub(crate) fn leap(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) -> bool {
-        let (surface, Some(graph)) = (self.shape.surface(), model.places.surface()) else { return false };
+    fn leap(&mut self, place_m: DVec3, displacement_m: &dyn Fn(PointId) -> DVec3) -> bool {
+        let surface = self.shape.surface();
         let Some(other) = surface.nearest(place_m) else { return false };
         let away_m = |place: &Place| {
             let vertices = surface.triangle(place).map(|vertex| PointId::new(vertex as usize));
-            let moved_m: DVec3 = (0..3)
-                .map(|corner| {
-                    let point = model.point_of(graph.slot_of(vertices[corner]));
-                    place.barycentric[corner] * displacement_m(point)
-                })
-                .sum();
+            let moved_m: DVec3 =
+                (0..3).map(|corner| place.barycentric[corner] * displacement_m(vertices[corner])).sum();
             place_m.distance(surface.at_m(place) + moved_m)
         };
         let is_nearer = away_m(&other) < away_m(&self.place) - NEARER * self.disc.radius_m();
@@ -135,20 +138,14 @@ impl MeshDisc {
         is_nearer
     }
 
-    /// Returns the weight of a vertex.
     #[allow(clippy::cast_possible_truncation)]
-    pub(crate) fn weight_of(&self, vertex: PointId) -> f64 {
-        self.disc.weight_of(vertex.index() as u32)
+    fn weight_of(&self, vertex: PointId) -> Option<f64> {
+        Some(self.disc.weight_of(vertex.index() as u32))
     }
 
-    /// Returns the vertices that the disc covers, with their weights, the derivatives of these by the place,
-    /// and their rest positions.
-    pub(crate) fn cover(&mut self) -> impl Iterator<Item = (PointId, f64, DVec2, DVec3)> + '_ {
-        let surface = self.shape.surface();
-        self.disc.lay(surface, &self.place);
-        self.disc.covered().iter().map(|covered| {
-            let vertex = covered.vertex as usize;
-            (PointId::new(vertex), covered.weight, covered.gradient, surface.vertices_m()[vertex])
-        })
+    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2)) {
+        self.disc.lay(self.shape.surface(), &self.place);
+        let covered = self.disc.covered().iter();
+        covered.for_each(|covered| add(PointId::new(covered.vertex as usize), covered.weight, covered.gradient));
     }
 }

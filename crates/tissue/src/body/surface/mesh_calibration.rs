@@ -5,7 +5,6 @@ use std::cell::RefCell;
 
 use glam::DVec3;
 
-use super::graph::{GraphFault, MeshGraph};
 use super::pack::MeshSprings;
 use super::slots::MeshSlots;
 use super::sweep::{MeshGrid, MeshSweep, Snapshot, gather};
@@ -15,6 +14,7 @@ use crate::kernel::lanes::{Width, run, shape};
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::springs::SpringCoefficients;
+use crate::scene::graph::{GraphFault, MeshGraph};
 use crate::scene::{Integrator, Lanes};
 use crate::scheme::Scheme;
 use crate::scheme::arithmetic::MAX_KEPT;

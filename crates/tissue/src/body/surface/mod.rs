@@ -27,7 +27,6 @@
 //! its mean edge.
 
 pub(crate) mod footprint;
-mod graph;
 mod mesh_calibration;
 mod order;
 mod pack;
@@ -39,32 +38,9 @@ mod sweep;
 #[cfg(test)]
 mod tests;
 
-pub use graph::{GraphFault, MeshGraph, MeshSpring};
+pub use crate::scene::graph::{GraphFault, MeshGraph, MeshSpring};
 pub use mesh_calibration::MeshTrial;
 pub(crate) use pack::MeshSprings;
 pub(crate) use places::{MeshPlaces, VolumePlaces};
 pub use slots::{MeshSlots, NO_VERTEX};
 pub(crate) use sweep::{MeshGrid, MeshSweep, Snapshot, gather};
-
-use crate::scene::Mesh;
-
-/// Adds a mesh to the bytes of a tissue's identity: its bounds and factors, its points in the order of the mesh and of
-/// memory, and its springs.
-pub(super) fn identify(mesh: &Mesh, graph: &MeshPlaces, add: &mut impl FnMut(&[u8])) {
-    add(b"mesh");
-    let mut numbers = |values: &[f64]| {
-        add(&(values.len() as u64).to_le_bytes());
-        values.iter().for_each(|value| add(&value.to_bits().to_le_bytes()));
-    };
-    numbers(&[mesh.stiffest.bound, mesh.stiffest.usual]);
-    numbers(&mesh.differences.relative_mass);
-    numbers(&mesh.differences.extra_anchor);
-    mesh.shape.vertices_m().iter().for_each(|vertex_m| numbers(&vertex_m.to_array()));
-    for corner in mesh.shape.triangles().iter().flatten().chain(graph.slots.vertex_of()) {
-        add(&corner.to_le_bytes());
-    }
-    for (ends, stiffness_n_per_m) in mesh.springs() {
-        ends.iter().for_each(|end| add(&end.to_le_bytes()));
-        add(&stiffness_n_per_m.to_bits().to_le_bytes());
-    }
-}

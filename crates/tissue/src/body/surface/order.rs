@@ -9,10 +9,10 @@ use std::cmp::Reverse;
 
 use palpate_geometry::work::spend;
 
-use super::graph::MeshGraph;
 use crate::kernel::field::BLOCK;
 use crate::kernel::region::TILE;
 use crate::memory;
+use crate::scene::graph::MeshGraph;
 
 /// Slots (places of vertices in memory) of a tile.
 pub(super) const TILE_SLOTS: usize = TILE * BLOCK;

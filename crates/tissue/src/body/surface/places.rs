@@ -5,15 +5,15 @@ use std::ops::Range;
 
 use glam::DVec3;
 
-use super::graph::{GraphFault, MeshGraph, MeshSpring};
 use super::order::{TABLES, TILE_SLOTS};
 use super::slots::{MeshSlots, NO_VERTEX};
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::real::Real;
 use crate::memory;
-use crate::scene::Mesh;
+use crate::scene::BodyKind;
+use crate::scene::graph::{GraphFault, MeshGraph};
 use crate::scene::profile::Poke;
-use crate::shape::{Extent, PointId, RestShape};
+use crate::shape::{Extent, PointId};
 
 /// The slots of a mesh, and their positions in space.
 #[derive(Debug)]
@@ -29,7 +29,7 @@ pub(crate) struct MeshPlaces {
     /// the end of the last.
     around: Vec<u32>,
     firsts_around: Vec<usize>,
-    /// The smallest K″ of a point of each tile divided by the reference value. Empty if all are 1.
+    /// The smallest K″ of an anchored point of each tile divided by the reference value. Empty if all are 1.
     least_pulls: Vec<f64>,
     /// The smallest extra K″/m of any point, at most 0; and the largest relative mass.
     pub(crate) least_extra: f64,
@@ -46,23 +46,22 @@ pub(crate) struct VolumePlaces {
     /// The fourth power of the unit of length divided by the volume, m. Times κ, it is the stiffness of the
     /// volume's growth.
     pub(crate) stretch_m: f64,
-    /// For each tile, the largest a of a movable point divided by its relative K″.
+    /// For each tile, the largest a of a movable point divided by its relative K″, if it has an anchor.
     pub(crate) reaches: Vec<f64>,
 }
 
 impl VolumePlaces {
-    fn of(mesh: &Mesh, slots: &MeshSlots) -> Option<Self> {
-        let volume = mesh.volume.as_deref()?;
-        let unit_m = mesh.shape.edge_m();
+    fn of(kind: &dyn BodyKind, slots: &MeshSlots) -> Option<Self> {
+        let (volume, shape) = (kind.volume()?, kind.shape());
+        let unit_m = shape.edge_m();
         let vertices = slots.vertex_of();
         let area = |vertex: &u32| {
             if *vertex == NO_VERTEX { DVec3::ZERO } else { volume.areas_m2[*vertex as usize] / (unit_m * unit_m) }
         };
         let areas: Vec<DVec3> = memory::collected(vertices.iter().map(area), TABLES);
         let reach = |slot: usize| {
-            let moves = vertices[slot] != NO_VERTEX && !mesh.shape.is_fixed(PointId::new(vertices[slot] as usize));
-            let pull = slots.mass(slot) * (1.0 + slots.extra_at(slot));
-            if moves { areas[slot].length() / pull } else { 0.0 }
+            let moves = vertices[slot] != NO_VERTEX && !shape.is_fixed(PointId::new(vertices[slot] as usize));
+            if moves { areas[slot].length() / pull_of(slots, slot).unwrap_or(1.0) } else { 0.0 }
         };
         let of_tile = |tile: usize| tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(areas.len());
         let reaches = (0..slots.tiles()).map(|tile| of_tile(tile).map(reach).fold(0.0, f64::max)).collect();
@@ -76,21 +75,20 @@ impl VolumePlaces {
     }
 }
 
+/// Returns K″ of a slot's point divided by the reference value; `None` for a point without an anchor. A tissue with such
+/// points does not sleep before it is still (`scheme::relaxation`), so what is divided by K″ does not matter for them.
+fn pull_of(slots: &MeshSlots, slot: usize) -> Option<f64> {
+    let pull = slots.mass(slot) * (1.0 + slots.extra_at(slot));
+    (pull > 0.0).then_some(pull)
+}
+
 impl MeshPlaces {
-    /// Lays out the mesh of a scene. The k of a spring is relative to the reference k.
+    /// Lays out the points and springs of a kind of tissue. The k of a spring is relative to the reference k.
     ///
     /// # Errors
     /// Returns the fault of its springs.
-    pub(crate) fn of(mesh: &Mesh) -> Result<Self, GraphFault> {
-        let springs = mesh.springs();
-        let graph = MeshGraph {
-            rest_m: mesh.shape.vertices_m().to_vec(),
-            springs: springs.map(|(ends, stiffness_n_per_m)| MeshSpring { ends, stiffness_n_per_m }).collect(),
-            spacing_m: mesh.shape.edge_m(),
-            relative_mass: mesh.differences.relative_mass.clone(),
-            extra_anchor: mesh.differences.extra_anchor.clone(),
-        };
-        let slots = MeshSlots::new(&graph)?;
+    pub(crate) fn of(kind: &dyn BodyKind, graph: &MeshGraph) -> Result<Self, GraphFault> {
+        let slots = MeshSlots::new(graph)?;
         let place_m = |vertex: &u32| if *vertex == NO_VERTEX { DVec3::NAN } else { graph.rest_m[*vertex as usize] };
         let rest_m = memory::collected(slots.vertex_of().iter().map(place_m), TABLES);
         let within =
@@ -119,14 +117,14 @@ impl MeshPlaces {
         let pulled = |tile: usize| {
             let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
             let own = own.filter(|slot| slots.vertex_of()[*slot] != NO_VERTEX);
-            own.map(|slot| slots.mass(slot) * (1.0 + slots.extra_at(slot))).fold(f64::INFINITY, f64::min)
+            own.filter_map(|slot| pull_of(&slots, slot)).reduce(f64::min).unwrap_or(1.0)
         };
         let is_even = slots.masses().is_empty() && slots.extra().is_empty();
         let least_pulls = if is_even { Vec::new() } else { (0..slots.tiles()).map(pulled).collect() };
         let least_extra = slots.extra().iter().copied().fold(0.0, f64::min);
         let largest_mass = slots.masses().iter().copied().reduce(f64::max).unwrap_or(1.0);
         let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
-        let volume = VolumePlaces::of(mesh, &slots);
+        let volume = VolumePlaces::of(kind, &slots);
         Ok(MeshPlaces {
             volume,
             balls,
@@ -188,7 +186,7 @@ impl MeshPlaces {
         &self.boxes[tile]
     }
 
-    /// Returns the smallest K″ of a tile's points divided by the reference value.
+    /// Returns the smallest K″ of a tile's anchored points divided by the reference value.
     pub(crate) fn least_pull(&self, tile: usize) -> f64 {
         self.least_pulls.get(tile).copied().unwrap_or(1.0)
     }

@@ -3,11 +3,11 @@
 
 use glam::DVec3;
 
-use super::graph::{GraphFault, MeshGraph};
 use super::order::{Adjacency, TABLES, TILE_SLOTS, order};
 use crate::kernel::field::{BLOCK, Layout};
 use crate::kernel::real::Real;
 use crate::memory;
+use crate::scene::graph::{GraphFault, MeshGraph};
 
 /// The vertex number of an empty slot in [`MeshSlots::vertex_of`]; no vertex has it.
 pub const NO_VERTEX: u32 = u32::MAX;

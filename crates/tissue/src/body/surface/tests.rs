@@ -6,7 +6,6 @@ use std::cell::RefCell;
 use glam::DVec3;
 
 use super::MeshTrial;
-use super::graph::{GraphFault, MeshGraph, MeshSpring};
 use super::mesh_calibration::FreeMotion;
 use super::order::TILE_SLOTS;
 use super::pack::{Arrangement, MeshSprings};
@@ -19,6 +18,7 @@ use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::springs::{SpringCoefficients, Springs};
 use crate::kernel::stage::Stage;
+use crate::scene::graph::{GraphFault, MeshGraph, MeshSpring};
 use crate::scene::{self, Lanes};
 
 const ALL_LANES: [Lanes; 4] = [Lanes::Plain, Lanes::Avx2, Lanes::Avx512, Lanes::Neon];

@@ -52,7 +52,7 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
             return POINTS.iter().find_map(|(points, kept)| {
                 let most = left.saturating_sub(*kept);
                 let mut work = most;
-                let law = on_mesh(model, disc, *points, &mut work, stop);
+                let law = of_fewer_points(model, disc, *points, &mut work, stop);
                 left -= most - work;
                 law
             });
@@ -68,7 +68,7 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
 }
 
 /// Computes a law with `points` of a mesh, and subtracts its work from `work`.
-fn on_mesh(model: &Model, disc: Disc, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
+fn of_fewer_points(model: &Model, disc: Disc, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
     let course = Course { points, ..course(disc, ROWS) };
     let law = follow(model, course, Accuracy::COARSE, work, stop)?;
     law.is_sound().then_some(Law { is_coarse: true, ..law })
@@ -199,7 +199,7 @@ mod tests {
         let shape = model.shape();
         let at_m = shape.rest_m(shape.nearest(glam::DVec3::new(0.02, 0.0, -0.05)));
         let (disc, mut work) = (Disc { radius_m: 0.006, at_m }, WORK);
-        let law = on_mesh(&model, disc, 250, &mut work, &AtomicBool::new(false)).unwrap();
+        let law = of_fewer_points(&model, disc, 250, &mut work, &AtomicBool::new(false)).unwrap();
         assert!(law.is_coarse && law.is_sound() && law.at_depth(0.003).force_n > 0.0 && work < WORK);
     }
 }

@@ -110,20 +110,21 @@ pub(crate) fn put_to_sleep<T: Real>(
     for (_, motion) in prescribed.grasped() {
         tiles.largest = tiles.largest.max(motion.displacement_m.length() / spacing_m);
     }
-    // In the scheme's units of force and velocity.
+    // In the scheme's units of force and velocity: the anchor springs, drag, and the stiffness that pulls a point back.
     let sheet = Oscillator::of(&model.scene);
     let (anchor_stiffness, drag) = sheet.scaled(plan.substep_s);
+    let restoring = Relaxation::of(&model.scene).scaled(plan.substep_s);
     // A displacement is known to half its last digit. The spring force that this rounding causes moves
     // nothing: it differs from point to point, and a point between its neighbours yields by as little. Nor
     // does a substep move anything by less than that digit, unless the scheme keeps the rounding error.
-    // (Without anchor springs all of it may matter.)
-    let half_digit = if anchor_stiffness > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
+    // (Where nothing pulls a point back, all of it may matter.)
+    let half_digit = if restoring > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
     let creep = if model.precision == Precision::Compensated { 0.0 } else { half_digit };
     let rough =
         Oscillator { spring_stiffness_n_per_m: stability::approximate_stiffness_n_per_m(&model.scene), ..sheet };
     let unknown = half_digit * rough.scaled_spring_stiffness(plan.substep_s) + creep * drag;
     let creep = creep * tiles.largest;
-    let slow = |epsilon: f64| (epsilon * anchor_stiffness.sqrt()).max(creep);
+    let slow = |epsilon: f64| (epsilon * restoring.sqrt()).max(creep);
     let settled = tiles.quiescent_tiles(&state.u, &state.d, slow);
     let epsilon = tiles.epsilon();
     let scale = plan.scheme.spring_scale();
@@ -134,7 +135,7 @@ pub(crate) fn put_to_sleep<T: Real>(
         pull: anchor_stiffness * scale,
     };
     // Where K″ is smaller, the same imbalance moves a point farther.
-    let least = anchor_stiffness * (1.0 + model.places.least_extra_anchor());
+    let least = restoring * (1.0 + model.places.least_extra_anchor());
     let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * least + unknown * survey.largest);
     let mut region = tiles.no_region();
     let mut sleepers = Vec::new();

@@ -1,4 +1,4 @@
-//! The input of the mesh kernel: points, and springs between any two of them, in the caller's numbering.
+//! Points, and springs between any two of them, as a kind of tissue describes itself to the kernel for meshes.
 
 use glam::DVec3;
 use thiserror::Error;
@@ -12,8 +12,8 @@ pub struct MeshSpring {
     pub stiffness_n_per_m: f64,
 }
 
-/// Points and springs of a tissue on a mesh: the input of [`MeshSlots::new`](super::MeshSlots::new), which checks it.
-/// Several springs may join the same points.
+/// Points and springs of a tissue in any arrangement, in the numbering of its rest shape. The kernel for meshes checks
+/// and takes it. Several springs may join the same points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshGraph {
     /// Rest position of each point, m; 1 to 2²⁸ points.
@@ -25,8 +25,8 @@ pub struct MeshGraph {
     pub spacing_m: f64,
     /// The mass of each point divided by the reference mass, above 0. Empty if all are 1.
     pub relative_mass: Vec<f64>,
-    /// K″/m of each point divided by the reference value, minus 1: above 0 where the tissue is stiffer. Empty
-    /// if all are 0.
+    /// K″/m of each point divided by the reference value, minus 1: above 0 where the tissue is stiffer,
+    /// −1 for a point without an anchor. Empty if all are 0.
     pub extra_anchor: Vec<f64>,
 }
 
@@ -58,30 +58,30 @@ pub enum GraphFault {
 }
 
 /// Largest number of points and of springs: records are counted in 32 bits.
-pub(super) const MAX_POINTS: usize = 1 << 28;
+const MAX_POINTS: usize = 1 << 28;
 
 /// The range of rest lengths, in spacings: the squares of tiny strains stay in the normal range (`Real::FAINT`).
 const LENGTHS: [f64; 2] = [1e-6, 1e6];
 
 impl MeshGraph {
     /// Returns the mass of a point divided by the reference mass.
-    pub(super) fn mass(&self, point: u32) -> f64 {
+    pub(crate) fn mass(&self, point: u32) -> f64 {
         self.relative_mass.get(point as usize).copied().unwrap_or(1.0)
     }
 
     /// Returns the extra K″/m of a point.
-    pub(super) fn extra(&self, point: u32) -> f64 {
+    pub(crate) fn extra(&self, point: u32) -> f64 {
         self.extra_anchor.get(point as usize).copied().unwrap_or(0.0)
     }
 
     /// Returns the vector from one point to another at rest, in spacings. With the ends exchanged it is exactly
     /// the opposite.
-    pub(super) fn rest(&self, from: u32, to: u32) -> DVec3 {
+    pub(crate) fn rest(&self, from: u32, to: u32) -> DVec3 {
         (self.rest_m[to as usize] - self.rest_m[from as usize]) / self.spacing_m
     }
 
     /// Checks that the graph can be computed. Returns the first fault.
-    pub(super) fn check(&self) -> Result<(), GraphFault> {
+    pub(crate) fn check(&self) -> Result<(), GraphFault> {
         let count = self.rest_m.len();
         if !(1..=MAX_POINTS).contains(&count) || self.springs.len() > MAX_POINTS {
             return Err(GraphFault::Count(count));

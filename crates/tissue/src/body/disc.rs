@@ -1,0 +1,81 @@
+//! The interface of a disc on a kind of tissue: the area over which a tool's tip touches it.
+
+use std::fmt;
+
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::saved::SavedPlace;
+use crate::shape::PointId;
+use palpate_refusal::Result;
+
+/// The disc of a tool on a kind of tissue, at a place of the rest surface. `body::footprint` asks it which points it
+/// covers, and computes everything else. All directions along the surface are those of [`Disc::cover`]'s gradients.
+pub(crate) trait Disc: fmt::Debug + Send + Sync {
+    /// Returns a copy.
+    fn boxed(&self) -> Box<dyn Disc>;
+
+    /// Returns the place as plain data.
+    fn saved(&self) -> SavedPlace;
+
+    /// Checks a saved place and moves there.
+    ///
+    /// # Errors
+    /// Refuses a place that is not on this tissue.
+    fn restore(&mut self, saved: &SavedPlace) -> Result<()>;
+
+    /// Moves back to an earlier place ([`Disc::saved`]). Returns whether the covered points may be others.
+    fn return_to(&mut self, saved: &SavedPlace) -> bool;
+
+    /// Returns the rest position of the place, m.
+    fn anchor_m(&self) -> DVec3;
+
+    /// Moves to the place of the rest surface nearest to `at_m`, m. Returns whether the covered points may be others.
+    fn put(&mut self, at_m: DVec3) -> bool;
+
+    /// Moves along the rest surface by `by_m`, m, in the directions of the place. Returns whether the covered points may
+    /// be others: a movement may be too small to matter.
+    fn walk(&mut self, by_m: DVec2) -> bool;
+
+    /// Moves to the place of the rest surface nearest to `place_m`, if the displaced surface is nearer there than at the
+    /// disc. `displacement_m` gives the displacement of a point, m. Returns whether it moved; never where walking leads
+    /// everywhere.
+    fn leap(&mut self, _place_m: DVec3, _displacement_m: &dyn Fn(PointId) -> DVec3) -> bool {
+        false
+    }
+
+    /// Returns how far a touching disc may move at once, m; infinite where the surface is a plane.
+    fn stride_m(&self) -> f64 {
+        f64::INFINITY
+    }
+
+    /// Returns whether the whole tissue rests in the plane z = 0, so that x and y are its directions.
+    fn is_flat(&self) -> bool {
+        false
+    }
+
+    /// Returns the unit normal out of the tissue at rest.
+    fn outward(&self) -> DVec3 {
+        DVec3::Z
+    }
+
+    /// Returns the change of the outward normal along the surface at rest, 1/m, as a mean over the disc.
+    fn curvature_per_m(&self) -> DMat3 {
+        DMat3::ZERO
+    }
+
+    /// Returns the side of a newly placed tool that is `height_m` above the surface: 1 outside, −1 inside. A tool below a
+    /// flat tissue presses on it from above.
+    fn side(&self, _height_m: f64) -> f64 {
+        1.0
+    }
+
+    /// Returns the weight of a movable point, which need not be covered; `None` if the points of [`Disc::cover`] are in
+    /// the order of memory, so that a search among them finds it.
+    fn weight_of(&self, _point: PointId) -> Option<f64> {
+        None
+    }
+
+    /// Calls `add` with each covered point, its weight w and ∂w/∂c, the derivative by the place, 1/m; each point once. The
+    /// weights add up to 1.
+    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2));
+}
