@@ -21,7 +21,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html 
 
 PACKAGES := deb wheel npm library image helm unity unreal
 
-.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos site
 
@@ -38,6 +38,7 @@ help:
 	@echo 'make test-long       every test of Rust in its long form; docs/tests.md lists the differences'
 	@echo 'make test-protocol   is proto/generated that of the protocol?'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
+	@echo 'make test-observe    traces for OpenTelemetry, an optional feature'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
 	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
@@ -190,6 +191,11 @@ test-viewer: build viewer
 # none of its own.
 INSTALL_PYTHON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/pip install --quiet --disable-pip-version-check \
 	--no-build-isolation --no-deps --force-reinstall ./clients/python
+# What an optional feature brings: a program with this feature takes the place of the other in target.
+test-observe: need-rust
+	$(CARGO) test --release --workspace --features palpate-server-tests/otlp --test observe
+	$(CARGO) test --release --package palpate --features otlp --lib traces::
+
 test-python: build $(VENV)/ready
 	$(INSTALL_PYTHON)
 	$(VENV)/bin/python -m unittest discover -s clients/python/tests -v

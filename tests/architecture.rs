@@ -392,8 +392,8 @@ fn dependencies_are_those_that_deny_toml_allows() {
     let banned: Vec<&str> =
         rules["bans"]["deny"].as_array().unwrap().iter().map(|one| one["crate"].as_str().unwrap()).collect();
     let tree = Command::new(env!("CARGO"))
-        .args(["tree", "--locked", "--offline", "--workspace", "--edges", "normal,build,dev", "--prefix", "none"])
-        .args(["--format", "{p}|{l}|{r}"])
+        .args(["tree", "--locked", "--offline", "--workspace", "--all-features", "--edges", "normal,build,dev"])
+        .args(["--prefix", "none", "--format", "{p}|{l}|{r}"])
         .current_dir(root)
         .output()
         .unwrap();

@@ -45,6 +45,9 @@ fn programs() -> &'static Path {
         // All programs, as `make build` does: a part of them might want other features of what both use, and so all of
         // that once more.
         build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(repository());
+        if cfg!(feature = "otlp") {
+            build.args(["--features", "palpate/otlp"]);
+        }
         // Cargo's variables for a test would change the input of build scripts, and libraries would be built once
         // more.
         let of_package = |key: &str| {

@@ -49,6 +49,19 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
     assert_eq!((later["palpate_sessions{state=\"running\"}"], later["palpate_points"]), (0.0, 0.0));
 }
 
+/// A program with this feature has tests of its own, `observe`.
+#[cfg(not(feature = "otlp"))]
+#[test]
+fn a_program_without_an_optional_feature_names_it() {
+    let refused = |program, arguments: &[&str], feature: &str| {
+        let output = Command::new(program).args(arguments).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(&format!("without the feature `{feature}`")), "{message}");
+    };
+    refused(server_program(), &["serve", "--listen", "127.0.0.1:0", "--otlp", "http://127.0.0.1:4317"], "otlp");
+}
+
 #[test]
 fn the_dashboard_shows_what_is_there_and_asks_for_nothing_else() {
     let folder = tempfile::tempdir().unwrap();

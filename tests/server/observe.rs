@@ -1,0 +1,9 @@
+//! What optional features show of a running server: traces. `make test-observe`.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "../common"]
+mod common {
+    pub mod server;
+}
+
+mod traces;
