@@ -38,7 +38,7 @@ help:
 	@echo 'make test-long       every test of Rust in its long form; docs/tests.md lists the differences'
 	@echo 'make test-protocol   is proto/generated that of the protocol?'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
-	@echo 'make test-observe    traces for OpenTelemetry, an optional feature'
+	@echo 'make test-observe    traces for OpenTelemetry and the bridge to Foxglove, which are optional features'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
 	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
@@ -191,9 +191,9 @@ test-viewer: build viewer
 # none of its own.
 INSTALL_PYTHON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/pip install --quiet --disable-pip-version-check \
 	--no-build-isolation --no-deps --force-reinstall ./clients/python
-# What an optional feature brings: a program with this feature takes the place of the other in target.
+# What optional features bring: a program with these features takes the place of the other in target.
 test-observe: need-rust
-	$(CARGO) test --release --workspace --features palpate-server-tests/otlp --test observe
+	$(CARGO) test --release --workspace --features palpate-server-tests/otlp,palpate-server-tests/foxglove --test observe
 	$(CARGO) test --release --package palpate --features otlp --lib traces::
 
 test-python: build $(VENV)/ready

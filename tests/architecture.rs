@@ -124,8 +124,8 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 15] = [
 ];
 
 /// The subcommands: none uses another.
-const SUBCOMMANDS: [&str; 11] =
-    ["admin", "bridge", "cluster", "devices", "health", "link", "load", "play", "proxy", "replay", "top"];
+const SUBCOMMANDS: [&str; 12] =
+    ["admin", "bridge", "cluster", "devices", "foxglove", "health", "link", "load", "play", "proxy", "replay", "top"];
 
 fn rust_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();

@@ -1,4 +1,5 @@
-//! What optional features show of a running server: traces. `make test-observe`.
+//! What optional features show of a running server: traces and the bridge to Foxglove. One program with both features:
+//! `make test-observe`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "../common"]
@@ -6,4 +7,5 @@ mod common {
     pub mod server;
 }
 
+mod foxglove;
 mod traces;

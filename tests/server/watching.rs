@@ -49,8 +49,8 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
     assert_eq!((later["palpate_sessions{state=\"running\"}"], later["palpate_points"]), (0.0, 0.0));
 }
 
-/// A program with this feature has tests of its own, `observe`.
-#[cfg(not(feature = "otlp"))]
+/// Programs with these features have tests of their own, `observe`.
+#[cfg(not(any(feature = "otlp", feature = "foxglove")))]
 #[test]
 fn a_program_without_an_optional_feature_names_it() {
     let refused = |program, arguments: &[&str], feature: &str| {
@@ -60,6 +60,7 @@ fn a_program_without_an_optional_feature_names_it() {
         assert!(message.contains(&format!("without the feature `{feature}`")), "{message}");
     };
     refused(server_program(), &["serve", "--listen", "127.0.0.1:0", "--otlp", "http://127.0.0.1:4317"], "otlp");
+    refused(client_program(), &["foxglove", &"0".repeat(32)], "foxglove");
 }
 
 #[test]
