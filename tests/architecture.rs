@@ -413,6 +413,53 @@ fn dependencies_are_those_that_deny_toml_allows() {
     }
 }
 
+/// A version of Rust as numbers that compare: 1.89 is 1.89.0.
+fn rust_version(text: &str) -> [u32; 3] {
+    let mut parts =
+        text.split('.').map(|part| part.parse().unwrap_or_else(|_| panic!("{text} is not a version of Rust")));
+    std::array::from_fn(|_| parts.next().unwrap_or(0))
+}
+
+#[test]
+fn no_dependency_needs_a_newer_rust_than_the_workspace_states() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let manifest: toml::Table = std::fs::read_to_string(root.join("Cargo.toml")).unwrap().parse().unwrap();
+    let stated = manifest["workspace"]["package"]["rust-version"].as_str().unwrap();
+    // All packages of Cargo.lock, also those of other systems and of optional features.
+    let metadata = Command::new(env!("CARGO"))
+        .args(["metadata", "--locked", "--offline", "--all-features", "--format-version", "1"])
+        .current_dir(root)
+        .output()
+        .unwrap();
+    assert!(metadata.status.success(), "{}", String::from_utf8_lossy(&metadata.stderr));
+    let metadata: serde_json::Value = serde_json::from_slice(&metadata.stdout).unwrap();
+    let packages = metadata["packages"].as_array().unwrap();
+    let mut compared = 0;
+    for package in packages {
+        let (name, version) = (package["name"].as_str().unwrap(), package["version"].as_str().unwrap());
+        let Some(needed) = package["rust_version"].as_str() else {
+            assert!(!package["source"].is_null(), "{name} does not state its version of Rust");
+            continue;
+        };
+        let newer = rust_version(needed) > rust_version(stated);
+        assert!(
+            !newer,
+            "{name} {version} needs Rust {needed}, but `rust-version` is {stated}: raise it, or take an older {name}"
+        );
+        compared += usize::from(!package["source"].is_null());
+    }
+    assert!(compared > 100, "only {compared} dependencies state a version of Rust");
+    // The generator of the protocol is a workspace of its own, and the guide states the same version.
+    let generator = std::fs::read_to_string(root.join("proto/generator/Cargo.toml")).unwrap();
+    assert!(generator.contains(&format!("rust-version = \"{stated}\"")), "proto/generator states another version");
+    for guide in
+        ["README.md", "CONTRIBUTING.md", "docs/platforms.md", "docs/your-language.md", "clients/python/README.md"]
+    {
+        let text = std::fs::read_to_string(root.join(guide)).unwrap();
+        assert!(text.contains(&format!("Rust {stated}")), "{guide} does not name Rust {stated}");
+    }
+}
+
 #[test]
 fn the_protocol_enters_at_the_wire() {
     for (folder, may) in [("crates/session", &["wire", "journal"][..]), (".", &["server", "program"])] {
