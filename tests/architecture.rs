@@ -413,6 +413,33 @@ fn dependencies_are_those_that_deny_toml_allows() {
     }
 }
 
+#[test]
+fn published_crates_have_the_version_of_the_workspace_and_use_published_ones_alone() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let read = |path: PathBuf| -> toml::Table { std::fs::read_to_string(path).unwrap().parse().unwrap() };
+    let workspace = read(root.join("Cargo.toml"))["workspace"].clone();
+    let version = &workspace["package"]["version"];
+    let mut published = BTreeSet::new();
+    for (folder, name, ..) in CRATES {
+        let manifest = read(root.join(folder).join("Cargo.toml"));
+        if manifest["package"].get("publish").is_some() {
+            assert!(workspace["dependencies"].get(name).is_none_or(|path| path.get("version").is_none()), "{name}");
+            continue;
+        }
+        published.insert(name);
+        assert_eq!(workspace["dependencies"][name].get("version"), Some(version), "{name}");
+        assert!(manifest["package"]["description"].as_str().is_some_and(|text| text.len() > 20), "{name}");
+        for licence in ["LICENSE-MIT", "LICENSE-APACHE"] {
+            let text = |folder: &Path| std::fs::read_to_string(folder.join(licence)).unwrap();
+            assert_eq!(text(&root.join(folder)), text(root), "{name}: {licence}");
+        }
+    }
+    assert_eq!(published.len(), 5, "{published:?}");
+    for (_, name, uses, _) in CRATES.iter().filter(|one| published.contains(one.1)) {
+        assert!(uses.iter().all(|used| published.contains(used)), "{name} uses a crate that is not published");
+    }
+}
+
 /// A version of Rust as numbers that compare: 1.89 is 1.89.0.
 fn rust_version(text: &str) -> [u32; 3] {
     let mut parts =
