@@ -19,9 +19,9 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-PACKAGES := deb wheel npm library image helm unity unreal
+PACKAGES := deb wheel npm crates library image helm unity unreal
 
-.PHONY: help run programs quick install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run fetched-crates programs quick install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos site
 
@@ -30,7 +30,7 @@ help:
 	@echo 'make protocol        proto/generated, the Rust code of the protocol, from its sources'
 	@echo 'make release         static server, client, container image and checksums in target/release-files; reports what it can not make'
 	@echo 'make packages        packages that need no compiler, with checksums, in target/packages (docs/packages.md); one alone:'
-	@echo '                     make package-deb, -wheel, -npm, -library, -image, -helm, -unity or -unreal'
+	@echo '                     make package-deb, -wheel, -npm, -crates, -library, -image, -helm, -unity or -unreal'
 	@echo 'make install         libpalpate for C, C++ and C#, and the programs, below PREFIX=/usr/local'
 	@echo 'make header          clients/c/include/palpate.h from its sources'
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run also builds it)'
@@ -38,6 +38,7 @@ help:
 	@echo 'make test-long       every test of Rust in its long form; docs/tests.md lists the differences'
 	@echo 'make test-protocol   is proto/generated that of the protocol?'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
+	@echo 'make test-observe    traces for OpenTelemetry and the bridge to Foxglove, which are optional features'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
 	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
@@ -133,12 +134,17 @@ release: need-rust page-if-node
 	CARGO=$(CARGO) sh contrib/release.sh
 
 # What each script packs is built first; `sh contrib/packages/NAME.sh` alone packs what is there.
-packages: build page-if-node
+packages: build page-if-node fetched-crates
 	BUILT='$(BUILT)' PYTHON='$(PYTHON)' NPM='$(NPM)' sh contrib/packages/all.sh
+
+# All of Cargo.lock: the script of the crates asks no network.
+fetched-crates: need-rust
+	$(CARGO) fetch --quiet --locked
 
 package-deb package-image: programs page-if-node
 package-wheel package-library package-unity package-unreal: build
 package-npm: viewer
+package-crates: fetched-crates
 $(PACKAGES:%=package-%): package-%:
 	BUILT='$(BUILT)' PYTHON='$(PYTHON)' NPM='$(NPM)' sh contrib/packages/$*.sh
 
@@ -196,6 +202,11 @@ test-viewer: build viewer
 # none of its own.
 INSTALL_PYTHON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/pip install --quiet --disable-pip-version-check \
 	--no-build-isolation --no-deps --force-reinstall ./clients/python
+# What optional features bring: a program with these features takes the place of the other in target.
+test-observe: need-rust
+	$(CARGO) test --release --workspace --features palpate-server-tests/otlp,palpate-server-tests/foxglove --test observe
+	$(CARGO) test --release --package palpate --features otlp --lib traces::
+
 test-python: build $(VENV)/ready
 	$(INSTALL_PYTHON)
 	$(VENV)/bin/python -m unittest discover -s clients/python/tests -v

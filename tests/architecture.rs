@@ -153,8 +153,8 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 16] = [
 ];
 
 /// The subcommands: none uses another.
-const SUBCOMMANDS: [&str; 11] =
-    ["admin", "bridge", "cluster", "devices", "health", "link", "load", "play", "proxy", "replay", "top"];
+const SUBCOMMANDS: [&str; 12] =
+    ["admin", "bridge", "cluster", "devices", "foxglove", "health", "link", "load", "play", "proxy", "replay", "top"];
 
 fn rust_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
@@ -431,8 +431,8 @@ fn dependencies_are_those_that_deny_toml_allows() {
     let banned: Vec<&str> =
         rules["bans"]["deny"].as_array().unwrap().iter().map(|one| one["crate"].as_str().unwrap()).collect();
     let tree = Command::new(env!("CARGO"))
-        .args(["tree", "--locked", "--offline", "--workspace", "--edges", "normal,build,dev", "--prefix", "none"])
-        .args(["--format", "{p}|{l}|{r}"])
+        .args(["tree", "--locked", "--offline", "--workspace", "--all-features", "--edges", "normal,build,dev"])
+        .args(["--prefix", "none", "--format", "{p}|{l}|{r}"])
         .current_dir(root)
         .output()
         .unwrap();
@@ -449,6 +449,80 @@ fn dependencies_are_those_that_deny_toml_allows() {
         let is_allowed =
             |one: &str| allowed.iter().chain(exceptions.get(name).into_iter().flatten()).any(|allowed| allowed == one);
         assert!(is_met(licence, &is_allowed), "{name}: deny.toml does not allow {licence:?}");
+    }
+}
+
+#[test]
+fn published_crates_have_the_version_of_the_workspace_and_use_published_ones_alone() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let read = |path: PathBuf| -> toml::Table { std::fs::read_to_string(path).unwrap().parse().unwrap() };
+    let workspace = read(root.join("Cargo.toml"))["workspace"].clone();
+    let version = &workspace["package"]["version"];
+    let mut published = BTreeSet::new();
+    for (folder, name, ..) in CRATES {
+        let manifest = read(root.join(folder).join("Cargo.toml"));
+        if manifest["package"].get("publish").is_some() {
+            assert!(workspace["dependencies"].get(name).is_none_or(|path| path.get("version").is_none()), "{name}");
+            continue;
+        }
+        published.insert(name);
+        assert_eq!(workspace["dependencies"][name].get("version"), Some(version), "{name}");
+        assert!(manifest["package"]["description"].as_str().is_some_and(|text| text.len() > 20), "{name}");
+        for licence in ["LICENSE-MIT", "LICENSE-APACHE"] {
+            let text = |folder: &Path| std::fs::read_to_string(folder.join(licence)).unwrap();
+            assert_eq!(text(&root.join(folder)), text(root), "{name}: {licence}");
+        }
+    }
+    assert_eq!(published.len(), 5, "{published:?}");
+    for (_, name, uses, _) in CRATES.iter().filter(|one| published.contains(one.1)) {
+        assert!(uses.iter().all(|used| published.contains(used)), "{name} uses a crate that is not published");
+    }
+}
+
+/// A version of Rust as numbers that compare: 1.89 is 1.89.0.
+fn rust_version(text: &str) -> [u32; 3] {
+    let mut parts =
+        text.split('.').map(|part| part.parse().unwrap_or_else(|_| panic!("{text} is not a version of Rust")));
+    std::array::from_fn(|_| parts.next().unwrap_or(0))
+}
+
+#[test]
+fn no_dependency_needs_a_newer_rust_than_the_workspace_states() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let manifest: toml::Table = std::fs::read_to_string(root.join("Cargo.toml")).unwrap().parse().unwrap();
+    let stated = manifest["workspace"]["package"]["rust-version"].as_str().unwrap();
+    // All packages of Cargo.lock, also those of other systems and of optional features.
+    let metadata = Command::new(env!("CARGO"))
+        .args(["metadata", "--locked", "--offline", "--all-features", "--format-version", "1"])
+        .current_dir(root)
+        .output()
+        .unwrap();
+    assert!(metadata.status.success(), "{}", String::from_utf8_lossy(&metadata.stderr));
+    let metadata: serde_json::Value = serde_json::from_slice(&metadata.stdout).unwrap();
+    let packages = metadata["packages"].as_array().unwrap();
+    let mut compared = 0;
+    for package in packages {
+        let (name, version) = (package["name"].as_str().unwrap(), package["version"].as_str().unwrap());
+        let Some(needed) = package["rust_version"].as_str() else {
+            assert!(!package["source"].is_null(), "{name} does not state its version of Rust");
+            continue;
+        };
+        let newer = rust_version(needed) > rust_version(stated);
+        assert!(
+            !newer,
+            "{name} {version} needs Rust {needed}, but `rust-version` is {stated}: raise it, or take an older {name}"
+        );
+        compared += usize::from(!package["source"].is_null());
+    }
+    assert!(compared > 100, "only {compared} dependencies state a version of Rust");
+    // The generator of the protocol is a workspace of its own, and the guide states the same version.
+    let generator = std::fs::read_to_string(root.join("proto/generator/Cargo.toml")).unwrap();
+    assert!(generator.contains(&format!("rust-version = \"{stated}\"")), "proto/generator states another version");
+    for guide in
+        ["README.md", "CONTRIBUTING.md", "docs/platforms.md", "docs/your-language.md", "clients/python/README.md"]
+    {
+        let text = std::fs::read_to_string(root.join(guide)).unwrap();
+        assert!(text.contains(&format!("Rust {stated}")), "{guide} does not name Rust {stated}");
     }
 }
 

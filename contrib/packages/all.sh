@@ -5,10 +5,10 @@ set -eu
 . "$(dirname "$0")/common.sh"
 
 # Those of another version, too, would be in SHA256SUMS.
-for ending in deb whl tgz tar.gz tar cdx.json; do rm -f "$out"/*palpate*."$ending"; done
+for ending in deb whl crate tgz tar.gz tar cdx.json; do rm -f "$out"/*palpate*."$ending"; done
 rm -f "$out/SHA256SUMS"
 missing=''
-for package in deb wheel npm library image helm unity unreal; do
+for package in deb wheel npm crates library image helm unity unreal; do
     status=0
     BUILT=$built OUT=$out sh $packages/$package.sh || status=$?
     case $status in

@@ -4,15 +4,19 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+#[cfg(feature = "otlp")]
+use palpate::server::traces::{self, Traces};
 use palpate::server::{self, Listeners, signals};
 use palpate_realtime::priority::{NETWORK_TURN, take_short_turns};
 use palpate_session::budget;
 use palpate_tissue::check_processor;
 use tokio_util::sync::CancellationToken;
-use tracing_subscriber::Registry;
+#[cfg(feature = "otlp")]
+use tracing_subscriber::filter::LevelFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 use tracing_subscriber::layer::{Filter, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{Layer, Registry};
 
 use super::{Failure, load_config, log};
 
@@ -48,6 +52,10 @@ pub(crate) struct ServeArguments {
     /// Serve Prometheus metrics at http://ADDRESS:PORT/metrics [default: off]
     #[arg(long, value_name = "ADDRESS:PORT")]
     metrics: Option<String>,
+    /// Send a trace of each call to a collector of OpenTelemetry, by OTLP over gRPC: http://HOST:4317. Needs a program
+    /// built with the feature `otlp` [default: off]
+    #[arg(long, value_name = "URL")]
+    otlp: Option<String>,
     /// Folder of the scenes that clients can create sessions from by name [default: scenes]
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
@@ -155,6 +163,9 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     if arguments.metrics.is_some() {
         config.metrics.clone_from(&arguments.metrics);
     }
+    if arguments.otlp.is_some() {
+        config.otlp.clone_from(&arguments.otlp);
+    }
     for (option, folder, key) in [
         ("--scenes", &arguments.scenes, &mut config.scenes),
         ("--scripts", &arguments.scripts, &mut config.scripts),
@@ -225,17 +236,21 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     budget::set_up_allocator();
     // Logging never blocks: lines that do not fit into the queue are dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
-    let subscriber = tracing_subscriber::fmt()
-        .with_max_level(tracing::Level::TRACE)
+    let log = tracing_subscriber::fmt::layer()
         // At level debug, the duration of each call and sampled step is logged when it ends.
         .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
         .with_ansi(std::io::stderr().is_terminal());
-    if arguments.log_json {
-        let subscriber = subscriber.json().with_writer(move || log::JsonRecords(writer.clone()));
-        subscriber.finish().with(filter).init();
+    let log = if arguments.log_json {
+        log.json().with_writer(move || log::JsonRecords(writer.clone())).boxed()
     } else {
-        subscriber.fmt_fields(log::fields()).with_writer(writer).finish().with(filter).init();
-    }
+        log.fmt_fields(log::fields()).with_writer(writer).boxed()
+    };
+    #[cfg(feature = "otlp")]
+    let (filter, traces) = (filter.with_target(traces::TARGET, LevelFilter::OFF), Traces::start(&config)?);
+    let layers = vec![log.with_filter(filter).boxed()];
+    #[cfg(feature = "otlp")]
+    let layers: Vec<_> = layers.into_iter().chain(traces.as_ref().map(|traces| traces.layer().boxed())).collect();
+    Registry::default().with(layers).init();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())
         .thread_name("network")
@@ -263,5 +278,9 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         Ok(server::serve(listeners, config, shutdown, ready).await?)
     });
     runtime.shutdown_background();
+    #[cfg(feature = "otlp")]
+    if let Some(traces) = traces {
+        traces.finish();
+    }
     ended
 }

@@ -196,6 +196,8 @@ where
                 if let Some(answer) = answer_if_not_grpc(&request) {
                     return Box::pin(async move { Ok(answer) });
                 }
+                // Of the span of traces, if there is one: no other has this field.
+                tracing::Span::current().record("enduser.id", &*caller.name);
                 let peer = request.extensions().get::<Peer>();
                 let name = ChargedCaller::account_name(presented.is_some().then_some(&*caller.name), peer);
                 let account = self.layer.budget.account(&name);

@@ -44,6 +44,9 @@ pub struct Config {
     /// Address for `/metrics` (Prometheus), without authentication: address:port, one that only this machine can reach
     /// unless `insecure` is set. `None` (default): no metrics.
     pub metrics: Option<String>,
+    /// URL of a collector of OpenTelemetry that gets traces of calls (OTLP over gRPC), such as `http://host:4317`.
+    /// `None` (default): no traces. Requires a program built with the feature `otlp`.
+    pub otlp: Option<String>,
     /// Folder of the scenes that clients can create sessions from by name. Default: `scenes`; it may be missing.
     pub scenes: PathBuf,
     /// Folder of the scripts that clients can request by name. Default: `scripts`; it may be missing.
@@ -98,6 +101,7 @@ impl Default for Config {
             datagrams: true,
             datagrams_advertise: None,
             metrics: None,
+            otlp: None,
             scenes: PathBuf::from("scenes"),
             scripts: PathBuf::from("scripts"),
             viewer: PathBuf::from("clients/viewer/dist"),
@@ -202,6 +206,7 @@ impl Config {
             let message = format!("must be host:port, such as tissue.example:7117, but is `{text}`");
             return Err(Refusal::new(Reason::WrongKind, "datagrams_advertise", message));
         }
+        self.check_otlp()?;
         let (most_s, day_s) = (self.limits.lease_s, 86400.0);
         let within = |most: f64| move |value: f64| value > 0.0 && value <= most;
         number("lease_s", self.lease_s, &format!("above 0 and at most limits.lease_s, {most_s}"), within(most_s))?;
@@ -225,6 +230,21 @@ impl Config {
             return Err(Refusal::new(Reason::OutOfRange, "journal_meshes", message));
         }
         number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
+        Ok(())
+    }
+
+    /// Checks the URL of the collector, and that the program can send traces.
+    fn check_otlp(&self) -> Result<()> {
+        let Some(url) = &self.otlp else { return Ok(()) };
+        if !cfg!(feature = "otlp") {
+            let message = "is set, but this program was built without the feature `otlp`";
+            return Err(Refusal::new(Reason::OutOfRange, "otlp", message));
+        }
+        let uri = url.parse::<http::Uri>().ok().filter(|uri| uri.host().is_some());
+        if !uri.is_some_and(|uri| matches!(uri.scheme_str(), Some("http" | "https"))) {
+            let message = format!("must be http://host:port or https://host:port, but is `{url}`");
+            return Err(Refusal::new(Reason::WrongKind, "otlp", message));
+        }
         Ok(())
     }
 

@@ -42,6 +42,8 @@ mod status;
 mod stream_termination;
 mod textures;
 mod tls;
+#[cfg(feature = "otlp")]
+pub mod traces;
 mod traffic;
 mod transport;
 mod uploads;

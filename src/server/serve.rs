@@ -273,7 +273,11 @@ async fn run(
         .initial_connection_window_size(limits.connection_window_bytes)
         // Browsers speak HTTP/2 only over TLS.
         .accept_http1(true)
-        .layer(cors(&origins))
+        .layer(cors(&origins));
+    // Outside of authorization, so that refused calls have spans too.
+    #[cfg(feature = "otlp")]
+    let serving = serving.layer(super::traces::TraceLayer);
+    let serving = serving
         .layer(authorize)
         .add_routes(routes.into())
         .serve_with_incoming_shutdown(incoming, drain.clone().cancelled_owned());

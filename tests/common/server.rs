@@ -45,6 +45,13 @@ fn programs() -> &'static Path {
         // All programs, as `make build` does: a part of them might want other features of what both use, and so all of
         // that once more.
         build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(repository());
+        // Benches have no `foxglove`.
+        #[allow(unexpected_cfgs)]
+        let optional =
+            [("palpate/otlp", cfg!(feature = "otlp")), ("palpate-programs/foxglove", cfg!(feature = "foxglove"))];
+        for (feature, _) in optional.iter().filter(|feature| feature.1) {
+            build.args(["--features", feature]);
+        }
         // Cargo's variables for a test would change the input of build scripts, and libraries would be built once
         // more.
         let of_package = |key: &str| {

@@ -49,6 +49,20 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
     assert_eq!((later["palpate_sessions{state=\"running\"}"], later["palpate_points"]), (0.0, 0.0));
 }
 
+/// Programs with these features have tests of their own, `observe`.
+#[cfg(not(any(feature = "otlp", feature = "foxglove")))]
+#[test]
+fn a_program_without_an_optional_feature_names_it() {
+    let refused = |program, arguments: &[&str], feature: &str| {
+        let output = Command::new(program).args(arguments).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(&format!("without the feature `{feature}`")), "{message}");
+    };
+    refused(server_program(), &["serve", "--listen", "127.0.0.1:0", "--otlp", "http://127.0.0.1:4317"], "otlp");
+    refused(client_program(), &["foxglove", &"0".repeat(32)], "foxglove");
+}
+
 #[test]
 fn the_dashboard_shows_what_is_there_and_asks_for_nothing_else() {
     let folder = tempfile::tempdir().unwrap();

@@ -27,6 +27,7 @@ mod bridge;
 mod cluster;
 mod credentials;
 mod devices;
+mod foxglove;
 mod health;
 mod link;
 mod load;
@@ -118,6 +119,17 @@ enum ClientCommand {
         device itself measures.\n\n\
         Exit status: 0; 1 when the device to test is missing or fails; 2 when an input was refused.")]
     Devices(devices::DevicesArguments),
+    /// Show a session live in Foxglove: its moving surface, its tools and the forces on them, energies
+    #[command(after_help = "Examples:\n  \
+        palpate-client foxglove 0123456789abcdef0123456789abcdef\n  \
+        palpate-client foxglove SESSION --server https://server:7117 --token-file watch.token --listen 127.0.0.1:0\n\n\
+        Watches the session like any viewer, with your credentials, and serves the topics of an exported journal by \
+        WebSocket: /surface (foxglove.PointCloud, frame `tissue`), /tool/N and /tissue. In Foxglove, choose `Open \
+        connection`, `Foxglove WebSocket`. Foxglove can't change the session. The WebSocket has no authentication of \
+        its own. Needs a program built with the feature `foxglove`.\n\n\
+        Exit status: 0; 1 when it can't listen, or when the session has ended or can't be reached; 2 when an input \
+        was refused.")]
+    Foxglove(foxglove::FoxgloveArguments),
     /// Simulate a bad network on this machine: relay TCP and UDP to a server with delay, jitter, loss and outages
     #[command(after_help = "Examples:\n  \
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --delay-ms 25 --loss 0.01\n  \
@@ -233,6 +245,7 @@ async fn main() -> ExitCode {
         ClientCommand::Link(arguments) => link::link(&arguments).await,
         ClientCommand::Bridge(arguments) => bridge::bridge(&arguments).await,
         ClientCommand::Devices(arguments) => devices::devices(&arguments).await,
+        ClientCommand::Foxglove(arguments) => foxglove::foxglove(&arguments).await,
         ClientCommand::Proxy(arguments) => proxy::proxy(&arguments).await,
         ClientCommand::Load(arguments) => load::load(&arguments).await,
         ClientCommand::Health(arguments) => health::health(&arguments).await,

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::io::{Seek, Write};
 use std::sync::Arc;
 
+use glam::DVec3;
 use mcap::{Channel, Message as Record, Schema, WriteOptions, Writer};
 use palpate_proto::geometry::vector;
 use palpate_proto::journal::foxglove::packed_element_field::NumericType;
@@ -36,7 +37,7 @@ fn unwritten(e: &mcap::McapError) -> Refusal {
     Refusal::new(Reason::Unreadable, "", format!("the export can't be written: {e}"))
 }
 
-fn schema(id: u16, name: &str, file: &str) -> Arc<Schema<'static>> {
+fn schema(id: u16, [name, file]: [&str; 2]) -> Arc<Schema<'static>> {
     let (name, encoding) = (name.to_owned(), "protobuf".to_owned());
     Arc::new(Schema { id, name, encoding, data: Cow::Owned(schema_of(file)) })
 }
@@ -44,6 +45,47 @@ fn schema(id: u16, name: &str, file: &str) -> Arc<Schema<'static>> {
 fn channel(id: u16, topic: String, schema: &Arc<Schema<'static>>) -> Arc<Channel<'static>> {
     let (schema, message_encoding) = (Some(schema.clone()), "protobuf".to_owned());
     Arc::new(Channel { id, topic, schema, message_encoding, metadata: BTreeMap::new() })
+}
+
+/// The schema of the topic `/tissue`: the name of the message, and its file in the protocol.
+pub const TISSUE_SCHEMA: [&str; 2] = ["palpate.journal.v1.TissueCurve", CURVES];
+/// The schema of the topics `/tool/0`, `/tool/1` and so on, likewise.
+pub const TOOL_SCHEMA: [&str; 2] = ["palpate.journal.v1.ToolCurve", CURVES];
+/// The schema of the topic `/surface`, likewise.
+pub const SURFACE_SCHEMA: [&str; 2] = ["foxglove.PointCloud", "foxglove/PointCloud.proto"];
+
+/// The file of the curves.
+const CURVES: &str = "palpate/journal/v1/curves.proto";
+
+/// Returns the points of a tissue as a message of the topic `/surface`, in the frame `tissue`. `unix_ns` is its time, ns
+/// since the Unix epoch; each point has a place and the length of its displacement, m, which become 32-bit floats.
+#[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+pub fn point_cloud(unix_ns: u64, points: impl Iterator<Item = (DVec3, f64)>) -> PointCloud {
+    let mut data = Vec::with_capacity(16 * points.size_hint().0);
+    for (at_m, moved_m) in points {
+        for number in [at_m.x, at_m.y, at_m.z, moved_m] {
+            data.extend((number as f32).to_le_bytes());
+        }
+    }
+    let field = |(name, offset): (&str, u32)| PackedElementField {
+        name: name.to_owned(),
+        offset,
+        r#type: NumericType::Float32.into(),
+    };
+    PointCloud {
+        timestamp: Some(prost_types::Timestamp {
+            seconds: (unix_ns / 1_000_000_000) as i64,
+            nanos: (unix_ns % 1_000_000_000) as i32,
+        }),
+        frame_id: "tissue".to_owned(),
+        pose: Some(Pose {
+            position: Some(Vector3::default()),
+            orientation: Some(Quaternion { w: 1.0, ..Quaternion::default() }),
+        }),
+        point_stride: 16,
+        fields: [("x", 0), ("y", 4), ("z", 8), ("displacement_m", 12)].map(field).to_vec(),
+        data,
+    }
 }
 
 /// Number before the channels of the tools: tool n has the channel 16 + n.
@@ -57,9 +99,7 @@ impl<W: Write + Seek> Export<W> {
     /// Refuses an output that can't be written ([`Reason::Unreadable`]).
     pub fn new(output: W, begun_ns: u64, session: &Session) -> Result<Self> {
         let options = WriteOptions::new().library(format!("palpate {VERSION}"));
-        let curves = "palpate/journal/v1/curves.proto";
-        let of_tissue = schema(2, "palpate.journal.v1.TissueCurve", curves);
-        let of_points = schema(3, "foxglove.PointCloud", "foxglove/PointCloud.proto");
+        let (of_tissue, of_points) = (schema(2, TISSUE_SCHEMA), schema(3, SURFACE_SCHEMA));
         Ok(Export {
             writer: options.create(output).map_err(|e| unwritten(&e))?,
             begun_ns,
@@ -67,7 +107,7 @@ impl<W: Write + Seek> Export<W> {
             rate_hz: session.model().scene.stepping.rate_hz,
             tissue: channel(1, "/tissue".to_owned(), &of_tissue),
             points: channel(2, "/surface".to_owned(), &of_points),
-            of_tools: schema(1, "palpate.journal.v1.ToolCurve", curves),
+            of_tools: schema(1, TOOL_SCHEMA),
             tools: BTreeMap::new(),
             newest: [None; 2],
         })
@@ -148,41 +188,17 @@ impl<W: Write + Seek> Export<W> {
     ///
     /// # Errors
     /// Refuses an output that can't be written ([`Reason::Unreadable`]).
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     pub fn surface(&mut self, session: &Session) -> Result<()> {
         let step = session.step_count();
         if !self.is_new(1, step) {
             return Ok(());
         }
         let model = session.model();
-        let mut data = Vec::with_capacity(16 * model.len());
-        for point in model.points() {
+        let point = |point| {
             let moved_m = session.tissue().point(point).displacement_m;
-            let at_m = model.shape().rest_m(point) + moved_m;
-            for number in [at_m.x, at_m.y, at_m.z, moved_m.length()] {
-                data.extend((number as f32).to_le_bytes());
-            }
-        }
-        let field = |(name, offset): (&str, u32)| PackedElementField {
-            name: name.to_owned(),
-            offset,
-            r#type: NumericType::Float32.into(),
+            (model.shape().rest_m(point) + moved_m, moved_m.length())
         };
-        let unix_ns = self.unix_ns(step);
-        let cloud = PointCloud {
-            timestamp: Some(prost_types::Timestamp {
-                seconds: (unix_ns / 1_000_000_000) as i64,
-                nanos: (unix_ns % 1_000_000_000) as i32,
-            }),
-            frame_id: "tissue".to_owned(),
-            pose: Some(Pose {
-                position: Some(Vector3::default()),
-                orientation: Some(Quaternion { w: 1.0, ..Quaternion::default() }),
-            }),
-            point_stride: 16,
-            fields: [("x", 0), ("y", 4), ("z", 8), ("displacement_m", 12)].map(field).to_vec(),
-            data,
-        };
+        let cloud = point_cloud(self.unix_ns(step), model.points().map(point));
         let channel = self.points.clone();
         self.write(&channel, step, &cloud)
     }
