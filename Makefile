@@ -10,20 +10,15 @@ SCRIPT ?= scripts/press.toml
 
 VENV := target/venv
 
-# The page: its sources, what npm installs for it, and what is built.
-# Its connection is the package of clients/typescript.
 VIEWER := clients/viewer
-TYPESCRIPT := clients/typescript
-PAGE := $(VIEWER)/dist/index.html
-MODULES := clients/node_modules/.package-lock.json
-PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
-	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
+# crates/xtask: the tasks that every system has, also one without make and a shell.
+XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 
 PACKAGES := deb wheel npm library image helm unity unreal
 
 .PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
-	need-python need-node chaos site
+	need-python chaos site
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, plot the force, and keep serving for a browser'
@@ -95,10 +90,6 @@ need-python:
 	@$(PYTHON) -c 'import sys, venv, ensurepip; assert sys.version_info >= (3, 9)' 2>/dev/null || \
 		{ echo 'Python 3.9 or later with venv is missing (Debian: apt-get install python3-venv)' >&2; exit 1; }
 
-need-node:
-	@$(NODE) -e 'const [major, minor] = process.versions.node.split("."); process.exit(major > 20 || major == 20 && minor >= 19 ? 0 : 1)' 2>/dev/null || \
-		{ echo 'Node.js 20.19 or later is missing: install it from https://nodejs.org' >&2; exit 1; }
-
 build: need-rust
 	$(CARGO) build --release --workspace
 
@@ -121,7 +112,7 @@ protocol: need-rust
 	cd proto/generator && $(CARGO) run $(GENERATOR)
 
 test-protocol: need-rust
-	cd proto/generator && $(CARGO) fmt --check && $(CARGO) test $(GENERATOR)
+	$(XTASK) test protocol
 
 release: need-rust page-if-node
 	CARGO=$(CARGO) sh contrib/release.sh
@@ -136,34 +127,16 @@ package-npm: viewer
 $(PACKAGES:%=package-%): package-%:
 	BUILT='$(BUILT)' PYTHON='$(PYTHON)' NPM='$(NPM)' sh contrib/packages/$*.sh
 
-$(MODULES): clients/package-lock.json | need-node
-	cd clients && $(NPM) ci
-	@touch $@
-
-$(PAGE): $(MODULES) $(PAGE_SOURCES)
-	cd $(VIEWER) && $(NPM) run build
-
-viewer: need-node $(PAGE)
+viewer: need-rust
+	@$(XTASK) page
 
 # Whoever has no Node.js, or no way to npm, is served all the same.
 page-if-node:
 	@$(MAKE) --no-print-directory viewer || echo 'So there is no page to look at; gRPC is served all the same.' >&2
 
-# The server runs until Ctrl-C, which reaches it as well as this shell. The page is built beside the programs: each has
-# parts that keep one core busy alone.
-run:
-	@$(MAKE) --no-print-directory -j2 programs page-if-node
-	@rm -f target/serving.txt; \
-	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
-	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
-	until grep -q http target/serving.txt; do kill -0 $$server 2>/dev/null || \
-		{ echo 'No server, so nothing to see. Another port: make run LISTEN=127.0.0.1:0' >&2; exit 1; }; sleep 0.05; done; \
-	url=$$(grep -o 'http.*' target/serving.txt); \
-	./target/release/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
-		|| { kill $$server; exit 1; }; \
-	echo; echo "The records are in target/poke.jsonl. Serving until Ctrl-C. To touch the tissue, open"; \
-	echo; echo "    $$url"; echo; \
-	wait $$server
+# The server runs until Ctrl-C.
+run: need-rust
+	@$(XTASK) run --listen '$(LISTEN)' --script '$(SCRIPT)'
 
 $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.txt | need-python
 	$(PYTHON) -m venv $(VENV)
@@ -171,35 +144,28 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 		-r clients/python/tests/requirements.txt
 	touch $@
 
-# The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
-# and `make stress` many.
-test: build $(VENV)/ready test-viewer test-python test-protocol
-	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast
-	sh tests/abi/check.sh $(BUILT) interface
-	$(VENV)/bin/python -m unittest discover -s tests/python -v
+# `cargo xtask test --plan` prints the commands. The random cases are the same every time, so that the result is that of the
+# change. `cargo test` alone draws others each time, and `make stress` many.
+test: need-rust
+	$(XTASK) test
 
 test-long: build
 	PALPATE_LONG=1 PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast -- --include-ignored \
 		--skip write_the_golden_file
 
-test-viewer: build viewer
-	cd $(VIEWER) && $(NPM) test
-	cd $(TYPESCRIPT) && $(NPM) test
+test-viewer: need-rust
+	$(XTASK) test viewer
+
+test-python: need-rust
+	$(XTASK) test python
 
 # As a user installs it, from what `build` has compiled: the tools for building are those of the environment, so that pip makes
 # none of its own.
 INSTALL_PYTHON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/pip install --quiet --disable-pip-version-check \
 	--no-build-isolation --no-deps --force-reinstall ./clients/python
-test-python: build $(VENV)/ready
-	$(INSTALL_PYTHON)
-	$(VENV)/bin/python -m unittest discover -s clients/python/tests -v
 
-lint: need-rust $(MODULES)
-	$(CARGO) fmt --all --check
-	$(PYTHON) tests/counts.py
-	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
-	cd $(TYPESCRIPT) && $(NPM) run lint
-	cd $(VIEWER) && $(NPM) run lint
+lint: need-rust
+	$(XTASK) lint
 
 picture: build
 	$(PYTHON) docs/poke.py
