@@ -16,7 +16,7 @@ XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 
 PACKAGES := deb wheel npm library image helm unity unreal
 
-.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python chaos site
 
@@ -35,6 +35,7 @@ help:
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
+	@echo 'make build-windows   programs and libpalpate for Windows, for its package (25 min the first time)'
 	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
 	@echo 'make check-macos     compiles the crates for macOS, without linking'
 	@echo 'make test-asan       the kernel under the address sanitizer'
@@ -239,6 +240,10 @@ need-cross:
 need-windows: need-cross
 	@command -v x86_64-w64-mingw32-gcc >/dev/null && { command -v wine64 >/dev/null || test -x /usr/lib/wine/wine64; } || \
 		{ echo 'A linker for Windows or Wine is missing. Debian: apt-get install gcc-mingw-w64-x86-64 wine64' >&2; exit 1; }
+
+# For the archive for Windows, which `make package-library` then also makes.
+build-windows: need-rust
+	CARGO='$(CARGO)' sh contrib/build-windows.sh
 
 test-windows: need-windows build
 	BUILT=$(BUILT) sh tests/windows/check.sh
