@@ -35,7 +35,7 @@ help:
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
-	@echo 'make build-windows   programs and libpalpate for Windows, for its package (25 min the first time)'
+	@echo 'make build-windows   programs, libpalpate and the module for Python for Windows, for its packages (25 min the first time)'
 	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
 	@echo 'make check-macos     compiles the crates for macOS, without linking'
 	@echo 'make test-asan       the kernel under the address sanitizer'
@@ -241,7 +241,7 @@ need-windows: need-cross
 	@command -v x86_64-w64-mingw32-gcc >/dev/null && { command -v wine64 >/dev/null || test -x /usr/lib/wine/wine64; } || \
 		{ echo 'A linker for Windows or Wine is missing. Debian: apt-get install gcc-mingw-w64-x86-64 wine64' >&2; exit 1; }
 
-# For the archive for Windows, which `make package-library` then also makes.
+# For the packages for Windows, which `make package-library` and `make package-wheel` then also make.
 build-windows: need-rust
 	CARGO='$(CARGO)' sh contrib/build-windows.sh
 

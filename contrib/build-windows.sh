@@ -1,6 +1,6 @@
 #!/bin/sh
 # Compiles for Windows (x86-64) on Linux: `sh contrib/build-windows.sh build --release ARGUMENT…`, which passes everything to cargo.
-# Without arguments it compiles the programs and libpalpate. The results are in
+# Without arguments it compiles what the packages have: programs, libpalpate and the module for Python. The results are in
 # $WINDOWS/x86_64-pc-windows-gnu/release [default: target/windows].
 #
 # It needs MinGW, and either the standard library for x86_64-pc-windows-gnu (`rustup target add x86_64-pc-windows-gnu`), or Debian's
@@ -11,7 +11,8 @@ cd "$(dirname "$0")/.."
 target=x86_64-pc-windows-gnu
 export CARGO_TARGET_X86_64_PC_WINDOWS_GNU_LINKER=x86_64-w64-mingw32-gcc CC_x86_64_pc_windows_gnu=x86_64-w64-mingw32-gcc
 if [ $# = 0 ]; then
-    set -- build --release -p palpate -p palpate-programs -p palpate-c --lib --bin palpate --bin palpate-client
+    set -- build --release -p palpate -p palpate-programs -p palpate-c -p palpate-python \
+        --lib --bin palpate --bin palpate-client
 fi
 cargo=${CARGO:-cargo}
 command -v x86_64-w64-mingw32-gcc >/dev/null ||

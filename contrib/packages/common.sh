@@ -58,7 +58,7 @@ only_of_windows() {
             # advapi32, bcrypt, …: the system's own; msvcrt and the universal C runtime are part of Windows 10 and later.
             advapi32.dll|api-ms-win-*|bcrypt.dll|bcryptprimitives.dll|cfgmgr32.dll|combase.dll|crypt32.dll|hid.dll|iphlpapi.dll) ;;
             kernel32.dll|msvcrt.dll|ncrypt.dll|ntdll.dll|ole32.dll|oleaut32.dll|pdh.dll|powrprof.dll|psapi.dll) ;;
-            secur32.dll|setupapi.dll|shell32.dll|ucrtbase.dll|user32.dll|userenv.dll|winmm.dll|ws2_32.dll|xinput1_4.dll) ;;
+            rpcrt4.dll|secur32.dll|setupapi.dll|shell32.dll|ucrtbase.dll|user32.dll|userenv.dll|winmm.dll|ws2_32.dll|xinput1_4.dll) ;;
             *) fail "$file needs $library, which Windows does not have" ;;
         esac
     done

@@ -1,8 +1,8 @@
 #!/bin/sh
-# Tries the package for Windows: `sh tests/windows/packages.sh`, after `make build-windows package-library`.
+# Tries the packages for Windows: `sh tests/windows/packages.sh`, after `make build-windows package-library package-wheel`.
 #
 # It unpacks the archive of libpalpate, builds the examples with its CMake package and MinGW, and runs them under Wine at a server on
-# this machine.
+# this machine. It lets pip install the wheel for Windows, and checks the names of its files.
 #
 # OUT is the folder of the packages [default: target/packages], BUILT that of the programs for this machine [target/release].
 set -eu
@@ -16,7 +16,10 @@ export WINEPREFIX="${WINEPREFIX:-$PWD/target/windows/wine}"
 
 say() { echo "packages for Windows: $*" >&2; }
 archive=$(echo "${OUT:=target/packages}"/libpalpate-*-windows-x86_64.zip)
-[ -f "$archive" ] || { say "$archive is missing: make build-windows package-library"; exit 3; }
+wheel=$(echo "$OUT"/palpate-*-cp39-abi3-win_amd64.whl)
+for file in "$archive" "$wheel"; do
+    [ -f "$file" ] || { say "$file is missing: make build-windows package-library package-wheel"; exit 3; }
+done
 python3 -m zipfile -e "$archive" "$work"
 folder=$work/$(basename "$archive" .zip)
 
@@ -67,3 +70,12 @@ for set in $sets; do
     # touch goes down until it feels 0.02 N, and then 3 mm further. How much it feels there depends on the machine's load.
     echo "$force" | awk '{ exit !($1 > 0.02) }'
 done
+
+for version in 3.9 3.13; do
+    python3 -m venv "$work/venv"
+    "$work/venv/bin/pip" install --quiet --disable-pip-version-check --no-index --no-deps --only-binary=:all: \
+        --platform win_amd64 --python-version "$version" --target "$work/site-$version" "$wheel"
+    test -f "$work/site-$version/palpate/_native.pyd" -a -f "$work/site-$version/palpate/__init__.py"
+done
+test ! -e "$work/site-3.9/palpate/_native.abi3.so"
+say "the wheel: pip takes it for Python 3.9 and 3.13 on Windows; it has $(ls "$work/site-3.9/palpate" | wc -l) files"
