@@ -10,20 +10,15 @@ SCRIPT ?= scripts/press.toml
 
 VENV := target/venv
 
-# The page: its sources, what npm installs for it, and what is built.
-# Its connection is the package of clients/typescript.
 VIEWER := clients/viewer
-TYPESCRIPT := clients/typescript
-PAGE := $(VIEWER)/dist/index.html
-MODULES := clients/node_modules/.package-lock.json
-PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
-	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
+# crates/xtask: the tasks that every system has, also one without make and a shell.
+XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 
 PACKAGES := deb wheel npm crates library image helm unity unreal
 
-.PHONY: help run fetched-crates programs quick install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
-	need-python need-node chaos site
+	need-python chaos site
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, plot the force, and keep serving for a browser'
@@ -41,6 +36,7 @@ help:
 	@echo 'make test-observe    traces for OpenTelemetry and the bridge to Foxglove, which are optional features'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
+	@echo 'make build-windows   programs, libpalpate and the module for Python for Windows, for its packages (25 min the first time)'
 	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
 	@echo 'make check-macos     compiles the crates for macOS, without linking'
 	@echo 'make test-asan       the kernel under the address sanitizer'
@@ -96,10 +92,6 @@ need-python:
 	@$(PYTHON) -c 'import sys, venv, ensurepip; assert sys.version_info >= (3, 9)' 2>/dev/null || \
 		{ echo 'Python 3.9 or later with venv is missing (Debian: apt-get install python3-venv)' >&2; exit 1; }
 
-need-node:
-	@$(NODE) -e 'const [major, minor] = process.versions.node.split("."); process.exit(major > 20 || major == 20 && minor >= 19 ? 0 : 1)' 2>/dev/null || \
-		{ echo 'Node.js 20.19 or later is missing: install it from https://nodejs.org' >&2; exit 1; }
-
 build: need-rust
 	$(CARGO) build --release --workspace
 
@@ -107,11 +99,6 @@ build: need-rust
 PROGRAMS := --package palpate --package palpate-programs
 programs: need-rust
 	$(CARGO) build --release $(PROGRAMS)
-
-# What `make run` starts: see the profile `quick` in Cargo.toml.
-quick: need-rust
-	$(CARGO) build --profile quick $(PROGRAMS)
-QUICK := $(or $(CARGO_TARGET_DIR),target)/quick
 
 # Below PREFIX: include, lib (with pkg-config and CMake), bin. As a package: DESTDIR=….
 PREFIX ?= /usr/local
@@ -128,7 +115,7 @@ protocol: need-rust
 	cd proto/generator && $(CARGO) run $(GENERATOR)
 
 test-protocol: need-rust
-	cd proto/generator && $(CARGO) fmt --check && $(CARGO) test $(GENERATOR)
+	$(XTASK) test protocol
 
 release: need-rust page-if-node
 	CARGO=$(CARGO) sh contrib/release.sh
@@ -148,34 +135,16 @@ package-crates: fetched-crates
 $(PACKAGES:%=package-%): package-%:
 	BUILT='$(BUILT)' PYTHON='$(PYTHON)' NPM='$(NPM)' sh contrib/packages/$*.sh
 
-$(MODULES): clients/package-lock.json | need-node
-	cd clients && $(NPM) ci
-	@touch $@
-
-$(PAGE): $(MODULES) $(PAGE_SOURCES)
-	cd $(VIEWER) && $(NPM) run build
-
-viewer: need-node $(PAGE)
+viewer: need-rust
+	@$(XTASK) page
 
 # Whoever has no Node.js, or no way to npm, is served all the same.
 page-if-node:
 	@$(MAKE) --no-print-directory viewer || echo 'So there is no page to look at; gRPC is served all the same.' >&2
 
-# The server runs until Ctrl-C, which reaches it as well as this shell. The page is built beside the programs: each has
-# parts that keep one core busy alone.
-run:
-	@$(MAKE) --no-print-directory -j2 quick page-if-node
-	@rm -f target/serving.txt; \
-	$(QUICK)/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
-	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
-	until grep -q http target/serving.txt; do kill -0 $$server 2>/dev/null || \
-		{ echo 'No server, so nothing to see. Another port: make run LISTEN=127.0.0.1:0' >&2; exit 1; }; sleep 0.05; done; \
-	url=$$(grep -o 'http.*' target/serving.txt); \
-	$(QUICK)/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
-		|| { kill $$server; exit 1; }; \
-	echo; echo "The records are in target/poke.jsonl. Serving until Ctrl-C. To touch the tissue, open"; \
-	echo; echo "    $$url"; echo; \
-	wait $$server
+# The server runs until Ctrl-C.
+run: need-rust
+	@$(XTASK) run --listen '$(LISTEN)' --script '$(SCRIPT)'
 
 $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.txt | need-python
 	$(PYTHON) -m venv $(VENV)
@@ -183,20 +152,20 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 		-r clients/python/tests/requirements.txt
 	touch $@
 
-# The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
-# and `make stress` many.
-test: build $(VENV)/ready test-viewer test-python test-protocol
-	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast
-	sh tests/abi/check.sh $(BUILT) interface
-	$(VENV)/bin/python -m unittest discover -s tests/python -v
+# `cargo xtask test --plan` prints the commands. The random cases are the same every time, so that the result is that of the
+# change. `cargo test` alone draws others each time, and `make stress` many.
+test: need-rust
+	$(XTASK) test
 
 test-long: build
 	PALPATE_LONG=1 PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast -- --include-ignored \
 		--skip write_the_golden_file
 
-test-viewer: build viewer
-	cd $(VIEWER) && $(NPM) test
-	cd $(TYPESCRIPT) && $(NPM) test
+test-viewer: need-rust
+	$(XTASK) test viewer
+
+test-python: need-rust
+	$(XTASK) test python
 
 # As a user installs it, from what `build` has compiled: the tools for building are those of the environment, so that pip makes
 # none of its own.
@@ -207,16 +176,9 @@ test-observe: need-rust
 	$(CARGO) test --release --workspace --features palpate-server-tests/otlp,palpate-server-tests/foxglove --test observe
 	$(CARGO) test --release --package palpate --features otlp --lib traces::
 
-test-python: build $(VENV)/ready
-	$(INSTALL_PYTHON)
-	$(VENV)/bin/python -m unittest discover -s clients/python/tests -v
 
-lint: need-rust $(MODULES)
-	$(CARGO) fmt --all --check
-	$(PYTHON) tests/counts.py
-	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
-	cd $(TYPESCRIPT) && $(NPM) run lint
-	cd $(VIEWER) && $(NPM) run lint
+lint: need-rust
+	$(XTASK) lint
 
 picture: build
 	$(PYTHON) docs/poke.py
@@ -290,6 +252,10 @@ need-cross:
 need-windows: need-cross
 	@command -v x86_64-w64-mingw32-gcc >/dev/null && { command -v wine64 >/dev/null || test -x /usr/lib/wine/wine64; } || \
 		{ echo 'A linker for Windows or Wine is missing. Debian: apt-get install gcc-mingw-w64-x86-64 wine64' >&2; exit 1; }
+
+# For the packages for Windows, which `make package-library` and `make package-wheel` then also make.
+build-windows: need-rust
+	CARGO='$(CARGO)' sh contrib/build-windows.sh
 
 test-windows: need-windows build
 	BUILT=$(BUILT) sh tests/windows/check.sh

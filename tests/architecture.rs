@@ -37,10 +37,11 @@ const MODULES: [(&str, &[&str]); 4] = [
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 16] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 17] = [
     ("crates/refusal", "palpate-refusal", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("crates/arguments", "palpate-arguments", &["palpate-refusal"], &["prost", "tokio", "tonic"]),
     ("crates/geometry", "palpate-geometry", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
+    ("crates/xtask", "palpate-xtask", &[], &["clap", "libc", "serde", "tokio"]),
     ("crates/haptics", "palpate-haptics", &[], &["axum", "prost", "tokio", "tonic"]),
     (
         "crates/tissue",
@@ -611,6 +612,7 @@ fn unsafe_code_is_where_vectors_are() {
         // Functions of the system, which any thread may call at any time.
         ("crates/session", "budget/machine.rs"),
         ("crates/realtime", "priority.rs"),
+        ("crates/xtask", "interrupt.rs"),
         ("crates/session", "surface/wide.rs"),
         ("crates/tissue", "kernel/lanes/mod.rs"),
         ("crates/tissue", "kernel/lanes/neon.rs"),

@@ -5,7 +5,7 @@ set -eu
 . "$(dirname "$0")/common.sh"
 
 # Those of another version, too, would be in SHA256SUMS.
-for ending in deb whl crate tgz tar.gz tar cdx.json; do rm -f "$out"/*palpate*."$ending"; done
+for ending in deb whl crate tgz tar.gz tar zip cdx.json; do rm -f "$out"/*palpate*."$ending"; done
 rm -f "$out/SHA256SUMS"
 missing=''
 for package in deb wheel npm crates library image helm unity unreal; do

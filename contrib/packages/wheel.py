@@ -36,7 +36,7 @@ def main():
     info = f"{name}-{version}.dist-info"
     texts = {file.name: file.read_bytes() for file in sorted(Path(licences).iterdir())}
     files = {f"{name}/{file.name}": file.read_bytes() for file in sorted((PACKAGE / name).iterdir()) if file.is_file()}
-    files[f"{name}/_native.abi3.so"] = Path(module).read_bytes()
+    files[f"{name}/{Path(module).name}"] = Path(module).read_bytes()
     files |= {f"{info}/licenses/{file}": text for file, text in texts.items()}
     files[f"{info}/METADATA"] = metadata(project, version, texts).encode()
     files[f"{info}/WHEEL"] = (
@@ -55,7 +55,7 @@ def main():
         for path, content in files.items():
             entry = zipfile.ZipInfo(path, when)
             entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = (0o100755 if path.endswith(".so") else 0o100644) << 16
+            entry.external_attr = (0o100755 if path.endswith((".so", ".pyd")) else 0o100644) << 16
             archive.writestr(entry, content, compresslevel=9)
     print(wheel)
 

@@ -18,7 +18,7 @@ from server import ROOT, Server
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAM, CLIENT = "target/release/palpate", "target/release/palpate-client"
-LANGUAGES = {"", "c", "python", "rust", "toml", "sh"}
+LANGUAGES = {"", "c", "powershell", "python", "rust", "toml", "sh"}
 
 
 def blocks():
@@ -39,7 +39,7 @@ class EveryBlock(unittest.TestCase):
         for path, line, language, mark, _ in blocks():
             with self.subTest(f"{path}:{line}"):
                 self.assertIn(language, LANGUAGES)
-                if mark or language in ("c", "rust"):
+                if mark or language in ("c", "powershell", "rust"):
                     self.assertRegex(mark, r"^not-run: \w+", "a mark is `not-run: REASON`")
 
     def test_the_commands_succeed(self):

@@ -1,9 +1,17 @@
-"""The chart of contrib/helm and the version in each package. `make test` builds no package."""
+"""The chart of contrib/helm, the version in each package, and the archives that Python packs. `make test` builds no package."""
 
+import base64
+import hashlib
 import importlib.util
 import json
+import os
+import pathlib
 import re
+import subprocess
+import sys
+import tempfile
 import unittest
+import zipfile
 
 import kubernetes_validate
 
@@ -69,6 +77,53 @@ class Version(unittest.TestCase):
                 self.assertEqual(json.loads((ROOT / name).read_text())["version"], version)
         chart = (ROOT / "contrib" / "helm" / "palpate" / "Chart.yaml").read_text()
         self.assertEqual(re.findall(r"^(?:appVersion|version): (.*)$", chart, re.MULTILINE), [version, version])
+
+
+def pack(script, *arguments):
+    """Runs a script of contrib/packages, with a fixed time, and returns what it prints."""
+    command = [sys.executable, ROOT / "contrib" / "packages" / script, *arguments]
+    environment = dict(os.environ, SOURCE_DATE_EPOCH="1700000000")
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.strip()
+
+
+class Archives(unittest.TestCase):
+    @unittest.skipIf(sys.version_info < (3, 11), "wheel.py needs tomllib")
+    def test_a_wheel_has_the_module_of_its_system_and_a_true_record(self):
+        modules = {"manylinux_2_34_x86_64": "_native.abi3.so", "win_amd64": "_native.pyd"}
+        for platform, module in modules.items():
+            with self.subTest(platform), tempfile.TemporaryDirectory() as folder:
+                folder = pathlib.Path(folder)
+                (folder / module).write_bytes(b"a module")
+                (folder / "licences").mkdir()
+                (folder / "licences" / "LICENSE-MIT").write_text("a licence")
+                wheel = pack("wheel.py", "1.2.3", platform, folder / module, folder / "licences", folder)
+                self.assertEqual(pathlib.Path(wheel).name, f"palpate-1.2.3-cp39-abi3-{platform}.whl")
+                with zipfile.ZipFile(wheel) as archive:
+                    names = archive.namelist()
+                    natives = [name for name in names if pathlib.Path(name).suffix in (".so", ".pyd")]
+                    self.assertEqual(natives, [f"palpate/{module}"])
+                    self.assertIn("palpate/__init__.py", names)
+                    self.assertIn(f"Tag: cp39-abi3-{platform}\n", archive.read("palpate-1.2.3.dist-info/WHEEL").decode())
+                    record = archive.read("palpate-1.2.3.dist-info/RECORD").decode().splitlines()
+                    self.assertEqual([line.split(",")[0] for line in record], names)
+                    for line in record[:-1]:
+                        name, digest, size = line.split(",")
+                        content = archive.read(name)
+                        own = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+                        self.assertEqual((digest, size), (f"sha256={own}", str(len(content))), name)
+
+    def test_the_same_files_give_the_same_archive(self):
+        with tempfile.TemporaryDirectory() as folder:
+            folder = pathlib.Path(folder)
+            (folder / "package" / "bin").mkdir(parents=True)
+            (folder / "package" / "bin" / "palpate.dll").write_bytes(b"a library")
+            (folder / "package" / "palpate.h").write_text("a header")
+            pack("zip.py", folder, "package", folder / "a.zip")
+            os.utime(folder / "package" / "palpate.h", (0, 0))
+            pack("zip.py", folder, "package", folder / "b.zip")
+            self.assertEqual((folder / "a.zip").read_bytes(), (folder / "b.zip").read_bytes())
+            with zipfile.ZipFile(folder / "a.zip") as archive:
+                self.assertEqual(archive.namelist(), ["package/bin/palpate.dll", "package/palpate.h"])
 
 
 if __name__ == "__main__":

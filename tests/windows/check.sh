@@ -10,17 +10,13 @@ set -eu
 cd "$(dirname "$0")/../.."
 built=${BUILT:-target/release}
 target=x86_64-pc-windows-gnu
-out=target/windows
-# The standard library is built with the programs: Debian has its sources, and no build of it for Windows.
-export RUSTC_BOOTSTRAP=1 RUSTC=/usr/bin/rustc RUSTDOC=/usr/bin/rustdoc
-export CARGO_TARGET_X86_64_PC_WINDOWS_GNU_LINKER=x86_64-w64-mingw32-gcc CC_x86_64_pc_windows_gnu=x86_64-w64-mingw32-gcc
+out=${WINDOWS:-target/windows}
 export WINEPREFIX="$PWD/$out/wine"
 work=$(mktemp -d)
 server=''
 trap 'if [ -n "$server" ]; then kill "$server" 2>/dev/null; fi; rm -rf "$work"' EXIT
 
 say() { echo "test-windows: $*" >&2; }
-cargo_for_windows() { /usr/bin/cargo "$@" -Zbuild-std=std,panic_unwind --target $target --target-dir $out --release; }
 windows() { sh tests/windows/wine.sh "$@"; }
 
 mkdir -p "$WINEPREFIX"
@@ -29,7 +25,7 @@ x86_64-w64-mingw32-gcc -O -shared tests/windows/bcryptprimitives.c -o "$work/bcr
 cp "$work/bcryptprimitives.dll" "$WINEPREFIX/drive_c/windows/system32/"
 
 say 'building'
-cargo_for_windows build -p palpate -p palpate-programs -p palpate-c --lib --bin palpate --bin palpate-client
+sh contrib/build-windows.sh
 exe=$out/$target/release
 
 hash_of() { grep -o '"final_hash":"[0-9a-f]*"' "$1" | tail -1 | cut -d '"' -f 4; }
@@ -74,9 +70,8 @@ serve windows "$exe/palpate.exe"
 "$built/palpate-client" replay press --server "$url" --scene liver --output "$work/one.jsonl" --quiet
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/both.jsonl" --quiet
 for example in look touch; do
-    # In MinGW, nanosleep is in libpthread.
     x86_64-w64-mingw32-gcc -std=c99 -I clients/c/include "clients/c/examples/$example.c" -o "$work/$example.exe" \
-        "$exe/palpate_c.dll" -lm -Wl,-Bstatic -lpthread
+        "$exe/palpate_c.dll" -lm
 done
 cp "$exe/palpate_c.dll" "$work"
 windows "$work/look.exe" "$url" liver 1

@@ -5,7 +5,19 @@
 #include <palpate.h>
 #include <stdio.h>
 #include <stdlib.h>
+#ifdef _WIN32
+#include <windows.h>
+#else
 #include <time.h>
+#endif
+
+static void sleep_ms(unsigned ms) {
+#ifdef _WIN32
+    Sleep(ms);
+#else
+    nanosleep(&(struct timespec){0, 1000000L * (long)ms}, NULL);
+#endif
+}
 
 /* State of the device. Until the loop ends, only the loop's thread uses it. */
 struct device {
@@ -72,7 +84,7 @@ int main(int count, char **arguments) {
         palpate_bridge_state state;
         palpate_bridge_look(bridge, &state);
         if (state.is_over) break;
-        nanosleep(&(struct timespec){0, 100000000L}, NULL);
+        sleep_ms(100);
     }
     palpate_bridge_report report = {0};
     if (bridge && palpate_bridge_end(bridge, &report)) status = failed("device");

@@ -3,7 +3,19 @@
 #include <palpate.h>
 #include <stdio.h>
 #include <stdlib.h>
+#ifdef _WIN32
+#include <windows.h>
+#else
 #include <time.h>
+#endif
+
+static void sleep_ms(unsigned ms) {
+#ifdef _WIN32
+    Sleep(ms);
+#else
+    nanosleep(&(struct timespec){0, 1000000L * (long)ms}, NULL);
+#endif
+}
 
 static int failed(const char *what) {
     fprintf(stderr, "%s: %s\n", what, palpate_last_error());
@@ -34,7 +46,7 @@ int main(int count, char **arguments) {
     for (int frame = 0; status == 0 && frame < (int)(60.0 * seconds); frame++) {
         if (palpate_surface_read(surface, &buffers, &dirty)) status = failed("read");
         buffers.everything = 0;
-        nanosleep(&(struct timespec){0, 1000000000L / 60}, NULL);
+        sleep_ms(16);
     }
     float least_m = 1e9f, most_m = -1e9f;
     for (size_t k = 0; k < size.vertices; k++) {

@@ -5,13 +5,34 @@
 #include <palpate.h>
 #include <stdio.h>
 #include <stdlib.h>
+#ifdef _WIN32
+#include <windows.h>
+#else
 #include <time.h>
+#endif
 
 static int failed(const char *what) {
     fprintf(stderr, "%s: %s\n", what, palpate_last_error());
     return 1;
 }
 
+#ifdef _WIN32
+/* Seconds of a monotonic clock. */
+static double now_s(void) {
+    LARGE_INTEGER now, per_s;
+    QueryPerformanceCounter(&now);
+    QueryPerformanceFrequency(&per_s);
+    return (double)now.QuadPart / (double)per_s.QuadPart;
+}
+
+/* Sleep() would wait for up to 15.6 ms. 2 is CREATE_WAITABLE_TIMER_HIGH_RESOLUTION, which older headers lack. */
+static void sleep_until(double time_s) {
+    static HANDLE timer;
+    if (!timer) timer = CreateWaitableTimerExW(NULL, NULL, 2, TIMER_ALL_ACCESS);
+    LARGE_INTEGER in = {.QuadPart = (LONGLONG)(-1e7 * (time_s - now_s()))};
+    if (in.QuadPart < 0 && SetWaitableTimer(timer, &in, 0, NULL, NULL, FALSE)) WaitForSingleObject(timer, INFINITE);
+}
+#else
 /* Seconds of a monotonic clock. */
 static double now_s(void) {
     struct timespec now;
@@ -23,6 +44,7 @@ static void sleep_until(double time_s) {
     struct timespec at = {(time_t)time_s, (long)(1e9 * (time_s - floor(time_s)))};
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, NULL);
 }
+#endif
 
 int main(int count, char **arguments) {
     double seconds = count == 4 ? strtod(arguments[3], NULL) : 0.0;

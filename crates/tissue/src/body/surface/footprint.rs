@@ -7,7 +7,6 @@ use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
 use crate::body::disc::Disc;
-use crate::body::model::Model;
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::MeshShape;
 use crate::shape::PointId;
