@@ -5644,7 +5644,7 @@ pub struct GetMeshResponse {
     pub vertices_x: u32,
     #[prost(uint32, tag = "2")]
     pub vertices_y: u32,
-    /// Distance of neighbouring vertices at rest; for a mesh, the median length of an edge.
+    /// Distance of neighbouring vertices at rest; for a mesh, the mean length of an edge.
     #[prost(double, tag = "3")]
     pub vertex_spacing_m: f64,
     /// x, y, z of each vertex at rest, m.
