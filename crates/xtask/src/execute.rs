@@ -75,6 +75,13 @@ pub(crate) fn command(step: &Step) -> Result<Command, Failure> {
     let here = std::env::current_dir().map_err(|error| Failure::Failed(format!("the current folder: {error}")))?;
     let mut command = Command::new(&step.program);
     command.args(&step.arguments).current_dir(here.join(step.folder));
+    // `cargo xtask` runs this with Cargo's variables of its own package. They are inputs of build scripts (ring's), so that
+    // libraries would be compiled again for every caller that does not have them, such as a test that builds the programs.
+    for (key, _) in std::env::vars_os() {
+        if is_of_package(&key.to_string_lossy()) {
+            command.env_remove(key);
+        }
+    }
     if let Some((name, value)) = step.variable {
         command.env(name, value);
     }
@@ -85,6 +92,12 @@ pub(crate) fn command(step: &Step) -> Result<Command, Failure> {
         command.env("PATH", path.map_err(|error| Failure::Failed(format!("PATH: {error}")))?);
     }
     Ok(command)
+}
+
+/// Returns whether Cargo sets a variable for the program of one package.
+fn is_of_package(key: &str) -> bool {
+    let starts = ["CARGO_MANIFEST_", "CARGO_PKG_", "CARGO_BIN_"].iter().any(|start| key.starts_with(start));
+    starts || key == "CARGO_CRATE_NAME" || key == "CARGO_PRIMARY_PACKAGE"
 }
 
 /// Runs a step to its end.
@@ -100,5 +113,23 @@ pub(crate) fn run(step: &Step) -> Result<(), Failure> {
             Err(Failure::Missing(format!("`{}` is missing, for `{step}`", step.program)))
         }
         Err(error) => Err(Failure::Failed(format!("`{step}` did not start: {error}"))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_has_no_variables_of_the_package_that_runs_it() {
+        assert!(std::env::var_os("CARGO_MANIFEST_DIR").is_some(), "cargo sets it for a test");
+        let step = Step { program: "cargo".to_owned(), ..Step::default() };
+        let command = command(&step).unwrap();
+        let removed: Vec<_> = command.get_envs().filter(|(_, value)| value.is_none()).map(|(key, _)| key).collect();
+        assert!(
+            removed.iter().any(|key| *key == "CARGO_MANIFEST_DIR")
+                && removed.iter().any(|key| *key == "CARGO_PKG_NAME")
+        );
+        assert!(removed.iter().all(|key| *key != "PATH"), "{removed:?}");
     }
 }
