@@ -21,12 +21,12 @@ use tungstenite::{Message, WebSocket};
 use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, client_program, force, open};
 
 /// The bridge, which ends with the test.
-struct Bridge {
+struct FoxgloveBridge {
     child: Child,
     url: String,
 }
 
-impl Bridge {
+impl FoxgloveBridge {
     fn start(server: &TestServer, session_id: &str) -> Self {
         let mut child = Command::new(client_program())
             .args(["foxglove", session_id, "--server", &server.url, "--listen", "127.0.0.1:0", "--frames-hz", "1000"])
@@ -38,11 +38,11 @@ impl Bridge {
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let url = line.split_whitespace().last().unwrap_or_default().to_owned();
         assert!(url.starts_with("ws://127.0.0.1:"), "{line:?}");
-        Bridge { child, url }
+        FoxgloveBridge { child, url }
     }
 }
 
-impl Drop for Bridge {
+impl Drop for FoxgloveBridge {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -50,13 +50,13 @@ impl Drop for Bridge {
 }
 
 /// A client of Foxglove's protocol, subscribed to every topic that it hears of.
-struct Viewer {
+struct FoxgloveViewer {
     socket: WebSocket<TcpStream>,
     /// The topic of each subscription, and the name of its schema.
     topics: BTreeMap<u32, (String, String)>,
 }
 
-impl Viewer {
+impl FoxgloveViewer {
     fn connect(url: &str) -> Self {
         let stream = TcpStream::connect(url.trim_start_matches("ws://")).unwrap();
         stream.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
@@ -64,7 +64,7 @@ impl Viewer {
         request.headers_mut().insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().unwrap());
         let (socket, response) = tungstenite::client(request, stream).unwrap();
         assert_eq!(response.headers()["sec-websocket-protocol"], "foxglove.sdk.v1");
-        Viewer { socket, topics: BTreeMap::new() }
+        FoxgloveViewer { socket, topics: BTreeMap::new() }
     }
 
     /// Waits for the next message of a topic; `None` when the connection has ended. Subscribes to topics that are
@@ -102,13 +102,13 @@ impl Viewer {
 
 /// The newest messages that have come.
 #[derive(Default, Debug, Clone)]
-struct Newest {
+struct NewestMessages {
     cloud: Option<Vec<[f32; 4]>>,
     tools: BTreeMap<u32, ToolCurve>,
     tissue: Option<TissueCurve>,
 }
 
-impl Newest {
+impl NewestMessages {
     fn take(&mut self, (topic, schema): &(String, String), message: &[u8]) {
         match topic.as_str() {
             "/surface" => {
@@ -155,13 +155,13 @@ fn pose(sequence: u64) -> pb::Command {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn foxglove_gets_the_surface_the_tools_and_the_energies_of_a_session() {
-    let (server, newest) = (TestServer::start(&[]), Arc::new(Mutex::new(Newest::default())));
+    let (server, newest) = (TestServer::start(&[]), Arc::new(Mutex::new(NewestMessages::default())));
     let session_id = server.paper(true).await;
-    let bridge = Bridge::start(&server, &session_id);
+    let bridge = FoxgloveBridge::start(&server, &session_id);
     let (url, taken) = (bridge.url.clone(), newest.clone());
     // Ends with the bridge.
     let receiver = std::thread::spawn(move || {
-        let mut viewer = Viewer::connect(&url);
+        let mut viewer = FoxgloveViewer::connect(&url);
         while let Some((topic, message)) = viewer.next() {
             taken.lock().unwrap().take(topic, &message);
         }

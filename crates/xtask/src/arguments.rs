@@ -2,16 +2,16 @@
 
 /// What a command line asks for.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Request {
+pub(crate) enum CommandLine {
     /// To print this text.
     Help(&'static str),
     /// To do a task, or only to print its commands.
-    Task { task: Task, only_plan: bool },
+    ProjectTask { task: ProjectTask, only_plan: bool },
 }
 
 /// A task, with its options.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Task {
+pub(crate) enum ProjectTask {
     /// Builds, serves, plays the script, and serves on.
     Run { listen: String, script: String },
     /// Runs these parts of the tests.
@@ -130,16 +130,16 @@ Exit status: 0 the page is there; 1 a command failed; 2 the arguments are wrong;
 ///
 /// # Errors
 /// Returns the reason why they are refused.
-pub(crate) fn read(arguments: &[String]) -> Result<Request, String> {
+pub(crate) fn read(arguments: &[String]) -> Result<CommandLine, String> {
     let mut words = arguments.iter().map(String::as_str);
     let (task, help) = match words.next() {
-        None | Some("--help" | "-h" | "help") => return Ok(Request::Help(HELP)),
+        None | Some("--help" | "-h" | "help") => return Ok(CommandLine::Help(HELP)),
         Some("run") => {
-            (Task::Run { listen: DEFAULT_LISTEN.to_owned(), script: DEFAULT_SCRIPT.to_owned() }, HELP_OF_RUN)
+            (ProjectTask::Run { listen: DEFAULT_LISTEN.to_owned(), script: DEFAULT_SCRIPT.to_owned() }, HELP_OF_RUN)
         }
-        Some("test") => (Task::Test(Vec::new()), HELP_OF_TEST),
-        Some("lint") => (Task::Lint, HELP_OF_LINT),
-        Some("page") => (Task::Page, HELP_OF_PAGE),
+        Some("test") => (ProjectTask::Test(Vec::new()), HELP_OF_TEST),
+        Some("lint") => (ProjectTask::Lint, HELP_OF_LINT),
+        Some("page") => (ProjectTask::Page, HELP_OF_PAGE),
         Some(other) => return Err(format!("there is no task `{other}`; there are run, test, lint and page")),
     };
     let (mut task, mut only_plan) = (task, false);
@@ -149,17 +149,18 @@ pub(crate) fn read(arguments: &[String]) -> Result<Request, String> {
             _ => (word, None),
         };
         match (&mut task, option) {
-            (_, "--help" | "-h") => return Ok(Request::Help(help)),
+            (_, "--help" | "-h") => return Ok(CommandLine::Help(help)),
             (_, "--plan") => only_plan = true,
-            (Task::Run { listen: value, .. }, "--listen") | (Task::Run { script: value, .. }, "--script") => {
+            (ProjectTask::Run { listen: value, .. }, "--listen")
+            | (ProjectTask::Run { script: value, .. }, "--script") => {
                 let given = attached.or_else(|| words.next()).filter(|given| !given.is_empty());
                 given.ok_or_else(|| format!("{option}: its value is missing"))?.clone_into(value);
             }
-            (Task::Test(parts), name) => parts.push(part(name)?),
+            (ProjectTask::Test(parts), name) => parts.push(part(name)?),
             (_, unknown) => return Err(format!("unknown argument `{unknown}`; --help lists those of the task")),
         }
     }
-    Ok(Request::Task { task, only_plan })
+    Ok(CommandLine::ProjectTask { task, only_plan })
 }
 
 fn part(name: &str) -> Result<TestPart, String> {
@@ -173,28 +174,35 @@ fn part(name: &str) -> Result<TestPart, String> {
 mod tests {
     use super::*;
 
-    fn read_line(line: &str) -> Result<Request, String> {
+    fn read_line(line: &str) -> Result<CommandLine, String> {
         let words: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
         read(&words)
     }
 
-    fn task(line: &str) -> Task {
+    fn task(line: &str) -> ProjectTask {
         match read_line(line) {
-            Ok(Request::Task { task, .. }) => task,
+            Ok(CommandLine::ProjectTask { task, .. }) => task,
             other => panic!("{line}: {other:?}"),
         }
     }
 
     #[test]
     fn a_task_has_the_documented_defaults_and_takes_its_options_in_both_forms() {
-        let run = |listen: &str, script: &str| Task::Run { listen: listen.to_owned(), script: script.to_owned() };
+        let run =
+            |listen: &str, script: &str| ProjectTask::Run { listen: listen.to_owned(), script: script.to_owned() };
         assert_eq!(task("run"), run("127.0.0.1:7117", "scripts/press.toml"));
         assert_eq!(task("run --listen 127.0.0.1:0"), run("127.0.0.1:0", "scripts/press.toml"));
         assert_eq!(task("run --script=a.toml --listen=[::1]:1"), run("[::1]:1", "a.toml"));
-        assert_eq!(task("test"), Task::Test(vec![]));
-        assert_eq!(task("test rust viewer"), Task::Test(vec![TestPart::Rust, TestPart::Viewer]));
-        assert!(matches!(read_line("lint --plan"), Ok(Request::Task { task: Task::Lint, only_plan: true })));
-        assert!(matches!(read_line("page"), Ok(Request::Task { task: Task::Page, only_plan: false })));
+        assert_eq!(task("test"), ProjectTask::Test(vec![]));
+        assert_eq!(task("test rust viewer"), ProjectTask::Test(vec![TestPart::Rust, TestPart::Viewer]));
+        assert!(matches!(
+            read_line("lint --plan"),
+            Ok(CommandLine::ProjectTask { task: ProjectTask::Lint, only_plan: true })
+        ));
+        assert!(matches!(
+            read_line("page"),
+            Ok(CommandLine::ProjectTask { task: ProjectTask::Page, only_plan: false })
+        ));
     }
 
     #[test]
@@ -215,7 +223,7 @@ mod tests {
     #[test]
     fn help_explains_every_task_and_part_and_fits_into_a_terminal() {
         let help = |line: &str| match read_line(line) {
-            Ok(Request::Help(text)) => text,
+            Ok(CommandLine::Help(text)) => text,
             other => panic!("{line}: {other:?}"),
         };
         for line in ["", "help", "--help", "run --help", "test -h", "lint --plan --help", "page --help"] {

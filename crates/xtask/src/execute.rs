@@ -3,36 +3,36 @@
 use std::path::PathBuf;
 use std::process::Command;
 
-use crate::plan::{Stage, Step};
+use crate::plan::{PlanStage, Step};
 use crate::serving;
 
 /// Reason why a task ends early.
 #[derive(Debug)]
-pub(crate) enum Failure {
+pub(crate) enum TaskFailure {
     /// A command failed.
     Failed(String),
     /// A program is missing.
     Missing(String),
 }
 
-impl Failure {
+impl TaskFailure {
     /// Returns the failure of a task that needs `what`, and the remedy.
     pub(crate) fn missing(what: &str, remedy: &str) -> Self {
-        Failure::Missing(format!("{what} is missing: {remedy}"))
+        TaskFailure::Missing(format!("{what} is missing: {remedy}"))
     }
 
     /// Returns the exit status.
     pub(crate) fn status(&self) -> u8 {
         match self {
-            Failure::Failed(_) => 1,
-            Failure::Missing(_) => 3,
+            TaskFailure::Failed(_) => 1,
+            TaskFailure::Missing(_) => 3,
         }
     }
 }
 
-impl std::fmt::Display for Failure {
+impl std::fmt::Display for TaskFailure {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let (Failure::Failed(message) | Failure::Missing(message)) = self;
+        let (TaskFailure::Failed(message) | TaskFailure::Missing(message)) = self;
         f.write_str(message)
     }
 }
@@ -41,27 +41,28 @@ impl std::fmt::Display for Failure {
 ///
 /// # Errors
 /// Returns the first failure; the stages after it do not run.
-pub(crate) fn execute(stages: &[Stage]) -> Result<(), Failure> {
+pub(crate) fn execute(stages: &[PlanStage]) -> Result<(), TaskFailure> {
     for stage in stages {
         match stage {
-            Stage::Step(step) => run(step)?,
-            Stage::Beside { step, others, without } => {
+            PlanStage::Step(step) => run(step)?,
+            PlanStage::Beside { step, others, without } => {
                 let others = others.clone();
                 let beside = std::thread::spawn(move || others.iter().try_for_each(run));
                 let ended = run(step);
                 if let Err(failure) =
-                    beside.join().map_err(|_| Failure::Failed("a thread has failed".to_owned())).flatten()
+                    beside.join().map_err(|_| TaskFailure::Failed("a thread has failed".to_owned())).flatten()
                 {
                     eprintln!("{failure}");
                     eprintln!("{without}");
                 }
                 ended?;
             }
-            Stage::Mark(file) => {
-                std::fs::write(file, "").map_err(|error| Failure::Failed(format!("can't write {file}: {error}")))?;
+            PlanStage::Mark(file) => {
+                std::fs::write(file, "")
+                    .map_err(|error| TaskFailure::Failed(format!("can't write {file}: {error}")))?;
             }
-            Stage::Note(text) => eprintln!("{text}"),
-            Stage::Serve { server, poke } => serving::serve(server, poke)?,
+            PlanStage::Note(text) => eprintln!("{text}"),
+            PlanStage::Serve { server, poke } => serving::serve(server, poke)?,
         }
     }
     Ok(())
@@ -71,8 +72,8 @@ pub(crate) fn execute(stages: &[Stage]) -> Result<(), Failure> {
 ///
 /// # Errors
 /// Returns an error if PATH can't be changed as the step asks.
-pub(crate) fn command(step: &Step) -> Result<Command, Failure> {
-    let here = std::env::current_dir().map_err(|error| Failure::Failed(format!("the current folder: {error}")))?;
+pub(crate) fn command(step: &Step) -> Result<Command, TaskFailure> {
+    let here = std::env::current_dir().map_err(|error| TaskFailure::Failed(format!("the current folder: {error}")))?;
     let mut command = Command::new(&step.program);
     command.args(&step.arguments).current_dir(here.join(step.folder));
     // `cargo xtask` runs this with Cargo's variables of its own package. They are inputs of build scripts (ring's), so that
@@ -89,7 +90,7 @@ pub(crate) fn command(step: &Step) -> Result<Command, Failure> {
         let before: Vec<PathBuf> = vec![here.join(folder)];
         let others = std::env::var_os("PATH").unwrap_or_default();
         let path = std::env::join_paths(before.into_iter().chain(std::env::split_paths(&others)));
-        command.env("PATH", path.map_err(|error| Failure::Failed(format!("PATH: {error}")))?);
+        command.env("PATH", path.map_err(|error| TaskFailure::Failed(format!("PATH: {error}")))?);
     }
     Ok(command)
 }
@@ -104,15 +105,15 @@ fn is_of_package(key: &str) -> bool {
 ///
 /// # Errors
 /// Returns an error if it can't be started, or fails.
-pub(crate) fn run(step: &Step) -> Result<(), Failure> {
+pub(crate) fn run(step: &Step) -> Result<(), TaskFailure> {
     eprintln!("{step}");
     match command(step)?.status() {
         Ok(status) if status.success() => Ok(()),
-        Ok(status) => Err(Failure::Failed(format!("`{step}` failed ({status})"))),
+        Ok(status) => Err(TaskFailure::Failed(format!("`{step}` failed ({status})"))),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            Err(Failure::Missing(format!("`{}` is missing, for `{step}`", step.program)))
+            Err(TaskFailure::Missing(format!("`{}` is missing, for `{step}`", step.program)))
         }
-        Err(error) => Err(Failure::Failed(format!("`{step}` did not start: {error}"))),
+        Err(error) => Err(TaskFailure::Failed(format!("`{step}` did not start: {error}"))),
     }
 }
 

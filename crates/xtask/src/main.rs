@@ -12,17 +12,17 @@ mod system;
 
 use std::process::ExitCode;
 
-use arguments::Request;
+use arguments::CommandLine;
 use system::System;
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args_os().skip(1).map(|one| one.to_string_lossy().into_owned()).collect();
     let request = match arguments::read(&arguments) {
-        Ok(Request::Help(text)) => {
+        Ok(CommandLine::Help(text)) => {
             println!("{text}");
             return ExitCode::SUCCESS;
         }
-        Ok(Request::Task { task, only_plan }) => (task, only_plan),
+        Ok(CommandLine::ProjectTask { task, only_plan }) => (task, only_plan),
         Err(message) => {
             eprintln!("xtask: {message}");
             return ExitCode::from(2);

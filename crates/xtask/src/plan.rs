@@ -1,7 +1,7 @@
 //! The commands of each task, in their order, as data: what runs is what `--plan` prints.
 
-use crate::arguments::{PARTS, Task, TestPart};
-use crate::execute::Failure;
+use crate::arguments::{PARTS, ProjectTask, TestPart};
+use crate::execute::TaskFailure;
 use crate::system::{REQUIREMENTS, System, VENV_READY};
 
 /// A command of a plan.
@@ -19,7 +19,7 @@ pub(crate) struct Step {
 
 /// A stage of a plan. The next begins when it has ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Stage {
+pub(crate) enum PlanStage {
     /// A command; the plan ends if it fails.
     Step(Step),
     /// A command, and others at the same time that may fail. If one does, the rest of them do not run, and this text is printed.
@@ -49,25 +49,25 @@ fn step(program: &str, arguments: &[&str]) -> Step {
 ///
 /// # Errors
 /// Returns what is missing for it.
-pub(crate) fn plan(task: &Task, system: &System) -> Result<Vec<Stage>, Failure> {
+pub(crate) fn plan(task: &ProjectTask, system: &System) -> Result<Vec<PlanStage>, TaskFailure> {
     match task {
-        Task::Run { listen, script } => Ok(system.run(listen, script)),
-        Task::Test(parts) => system.test(parts),
-        Task::Lint => system.lint(),
-        Task::Page => system.need_node().map(|()| system.page().into_iter().map(Stage::Step).collect()),
+        ProjectTask::Run { listen, script } => Ok(system.run(listen, script)),
+        ProjectTask::Test(parts) => system.test(parts),
+        ProjectTask::Lint => system.lint(),
+        ProjectTask::Page => system.need_node().map(|()| system.page().into_iter().map(PlanStage::Step).collect()),
     }
 }
 
 impl System {
-    fn need_node(&self) -> Result<(), Failure> {
-        let told = || Failure::missing("Node.js 20.19 or later", "install it from https://nodejs.org");
+    fn need_node(&self) -> Result<(), TaskFailure> {
+        let told = || TaskFailure::missing("Node.js 20.19 or later", "install it from https://nodejs.org");
         self.has_node.then_some(()).ok_or_else(told)
     }
 
-    fn need_python(&self) -> Result<(), Failure> {
+    fn need_python(&self) -> Result<(), TaskFailure> {
         let told = || {
             let remedy = "install it from https://www.python.org (Debian: apt-get install python3-venv)";
-            Failure::missing("Python 3.9 or later with venv", remedy)
+            TaskFailure::missing("Python 3.9 or later with venv", remedy)
         };
         self.has_python.then_some(()).ok_or_else(told)
     }
@@ -104,7 +104,7 @@ impl System {
         self.modules().into_iter().chain(build).collect()
     }
 
-    fn run(&self, listen: &str, script: &str) -> Vec<Stage> {
+    fn run(&self, listen: &str, script: &str) -> Vec<PlanStage> {
         // The two programs alone, and optimized where it matters (Cargo.toml): the libraries for C and Python take as long
         // again. The page is built at the same time, because
         // each has parts that keep one core busy alone.
@@ -112,29 +112,29 @@ impl System {
             self.cargo(&["build", "--profile", "quick", "--package", "palpate", "--package", "palpate-programs"]);
         let mut stages = Vec::new();
         match self.has_node {
-            true if self.page().is_empty() => stages.push(Stage::Step(programs)),
-            true => stages.push(Stage::Beside { step: programs, others: self.page(), without: WITHOUT_PAGE }),
+            true if self.page().is_empty() => stages.push(PlanStage::Step(programs)),
+            true => stages.push(PlanStage::Beside { step: programs, others: self.page(), without: WITHOUT_PAGE }),
             false => {
                 let missing = format!("`{}` is not Node.js 20.19 or later. {WITHOUT_PAGE}", self.node);
-                stages.extend([Stage::Note(missing), Stage::Step(programs)]);
+                stages.extend([PlanStage::Note(missing), PlanStage::Step(programs)]);
             }
         }
         let poke = ["replay", script, "--output", "target/poke.jsonl", "--plot"];
-        stages.push(Stage::Serve {
+        stages.push(PlanStage::Serve {
             server: step(&self.built("palpate"), &["serve", "--listen", listen, "--log", "warn"]),
             poke: step(&self.built("palpate-client"), &poke),
         });
         stages
     }
 
-    fn test(&self, asked: &[TestPart]) -> Result<Vec<Stage>, Failure> {
+    fn test(&self, asked: &[TestPart]) -> Result<Vec<PlanStage>, TaskFailure> {
         let is_asked = |part: TestPart| asked.is_empty() || asked.contains(&part);
         let mut stages = Vec::new();
         if [TestPart::Viewer, TestPart::Python, TestPart::Rust, TestPart::Abi, TestPart::Documents]
             .into_iter()
             .any(is_asked)
         {
-            stages.push(Stage::Step(self.cargo(&["build", "--release", "--workspace"])));
+            stages.push(PlanStage::Step(self.cargo(&["build", "--release", "--workspace"])));
         }
         if [TestPart::Python, TestPart::Documents].into_iter().any(is_asked) {
             self.need_python()?;
@@ -144,9 +144,9 @@ impl System {
             match part {
                 TestPart::Viewer => {
                     self.need_node()?;
-                    stages.extend(self.page().into_iter().map(Stage::Step));
+                    stages.extend(self.page().into_iter().map(PlanStage::Step));
                     stages.extend(
-                        ["clients/viewer", "clients/typescript"].map(|of| Stage::Step(self.npm(of, &["test"]))),
+                        ["clients/viewer", "clients/typescript"].map(|of| PlanStage::Step(self.npm(of, &["test"]))),
                     );
                 }
                 // The tools for building are those of the environment, so that pip makes none of its own; what is compiled is
@@ -154,31 +154,31 @@ impl System {
                 TestPart::Python => {
                     let install = ["--no-build-isolation", "--no-deps", "--force-reinstall", "./clients/python"];
                     let install = Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) };
-                    stages.push(Stage::Step(install));
-                    stages.push(Stage::Step(self.unittest("clients/python/tests")));
+                    stages.push(PlanStage::Step(install));
+                    stages.push(PlanStage::Step(self.unittest("clients/python/tests")));
                 }
                 TestPart::Protocol => {
                     let format = Step { folder: "proto/generator", ..self.cargo(&["fmt", "--check"]) };
                     let generator = ["test", "--quiet", "--locked", "--target-dir", "../../target/generator"];
                     let compare = Step { folder: "proto/generator", ..self.cargo(&generator) };
-                    stages.extend([Stage::Step(format), Stage::Step(compare)]);
+                    stages.extend([PlanStage::Step(format), PlanStage::Step(compare)]);
                 }
                 TestPart::Rust => {
                     let test = self.cargo(&["test", "--release", "--workspace", "--no-fail-fast"]);
-                    stages.push(Stage::Step(Step { variable: Some(SEED), ..test }));
+                    stages.push(PlanStage::Step(Step { variable: Some(SEED), ..test }));
                 }
                 TestPart::Abi if self.has_shell && !self.is_windows => {
                     let built = format!("{}/release", self.target);
-                    stages.push(Stage::Step(step("sh", &["tests/abi/check.sh", &built, "interface"])));
+                    stages.push(PlanStage::Step(step("sh", &["tests/abi/check.sh", &built, "interface"])));
                 }
                 TestPart::Abi if asked.is_empty() => {
                     let reason = "the comparison of libpalpate's interface: it needs a Unix with a POSIX shell";
-                    stages.push(Stage::Note(format!("left out: {reason}")));
+                    stages.push(PlanStage::Note(format!("left out: {reason}")));
                 }
                 TestPart::Abi => {
-                    return Err(Failure::missing("a Unix with a POSIX shell", "the part `abi` can't run here"));
+                    return Err(TaskFailure::missing("a Unix with a POSIX shell", "the part `abi` can't run here"));
                 }
-                TestPart::Documents => stages.push(Stage::Step(self.unittest("tests/python"))),
+                TestPart::Documents => stages.push(PlanStage::Step(self.unittest("tests/python"))),
             }
         }
         Ok(stages)
@@ -189,15 +189,15 @@ impl System {
         self.venv_python(&[&own[..], arguments].concat())
     }
 
-    fn venv(&self) -> Vec<Stage> {
+    fn venv(&self) -> Vec<PlanStage> {
         if self.has_venv {
             return Vec::new();
         }
         let install = self.pip(&["-r", REQUIREMENTS[0], "-r", REQUIREMENTS[1]]);
         vec![
-            Stage::Step(step(&self.python, &["-m", "venv", "target/venv"])),
-            Stage::Step(install),
-            Stage::Mark(VENV_READY),
+            PlanStage::Step(step(&self.python, &["-m", "venv", "target/venv"])),
+            PlanStage::Step(install),
+            PlanStage::Mark(VENV_READY),
         ]
     }
 
@@ -205,31 +205,31 @@ impl System {
         self.venv_python(&["-m", "unittest", "discover", "-s", folder, "-v"])
     }
 
-    fn lint(&self) -> Result<Vec<Stage>, Failure> {
+    fn lint(&self) -> Result<Vec<PlanStage>, TaskFailure> {
         self.need_python()?;
         self.need_node()?;
         let clippy = ["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"];
         let steps =
             [self.cargo(&["fmt", "--all", "--check"]), step(&self.python, &["tests/counts.py"]), self.cargo(&clippy)];
         let pages = ["clients/typescript", "clients/viewer"].map(|of| self.npm(of, &["run", "lint"]));
-        Ok(steps.into_iter().chain(self.modules()).chain(pages).map(Stage::Step).collect())
+        Ok(steps.into_iter().chain(self.modules()).chain(pages).map(PlanStage::Step).collect())
     }
 }
 
 /// Returns the text of `--plan`: a line for each command, with what else happens as comments.
-pub(crate) fn shown(stages: &[Stage]) -> String {
+pub(crate) fn shown(stages: &[PlanStage]) -> String {
     let mut text = String::new();
     let mut add = |line: String| text += &(line + "\n");
     for stage in stages {
         match stage {
-            Stage::Step(step) => add(step.to_string()),
-            Stage::Beside { step, others, .. } => {
+            PlanStage::Step(step) => add(step.to_string()),
+            PlanStage::Beside { step, others, .. } => {
                 add(step.to_string());
                 others.iter().for_each(|other| add(format!("{other}   # at the same time; may fail")));
             }
-            Stage::Mark(file) => add(format!("# marks {file}")),
-            Stage::Note(text) => add(format!("# {text}")),
-            Stage::Serve { server, poke } => {
+            PlanStage::Mark(file) => add(format!("# marks {file}")),
+            PlanStage::Note(text) => add(format!("# {text}")),
+            PlanStage::Serve { server, poke } => {
                 add(format!("{server}   # until Ctrl-C"));
                 add(format!("{poke} --server URL   # the server's URL, when it listens"));
             }
@@ -277,12 +277,12 @@ mod tests {
         System { has_modules: true, has_page: true, has_venv: true, ..machine(is_windows) }
     }
 
-    fn lines(task: &Task, system: &System) -> Vec<String> {
+    fn lines(task: &ProjectTask, system: &System) -> Vec<String> {
         shown(&plan(task, system).unwrap()).lines().map(str::to_owned).collect()
     }
 
-    fn run() -> Task {
-        Task::Run { listen: "127.0.0.1:0".to_owned(), script: "a.toml".to_owned() }
+    fn run() -> ProjectTask {
+        ProjectTask::Run { listen: "127.0.0.1:0".to_owned(), script: "a.toml".to_owned() }
     }
 
     const PROGRAMS: &str = "cargo build --profile quick --package palpate --package palpate-programs";
@@ -320,7 +320,7 @@ mod tests {
 
     #[test]
     fn test_runs_every_part_with_the_programs_of_the_system() {
-        let unix = lines(&Task::Test(vec![]), &built(false));
+        let unix = lines(&ProjectTask::Test(vec![]), &built(false));
         assert_eq!(
             unix,
             [
@@ -337,7 +337,7 @@ mod tests {
                 "target/venv/bin/python -m unittest discover -s tests/python -v",
             ]
         );
-        let windows = lines(&Task::Test(vec![]), &built(true));
+        let windows = lines(&ProjectTask::Test(vec![]), &built(true));
         assert_eq!(windows.len(), unix.len());
         for (windows, unix) in windows.iter().zip(&unix) {
             let same = unix.replace("venv/bin/python", "venv/Scripts/python.exe").replace(") npm ", ") npm.cmd ");
@@ -351,17 +351,21 @@ mod tests {
     #[test]
     fn parts_run_in_one_order_and_need_only_what_they_use() {
         let bare = System { has_node: false, has_python: false, has_shell: false, ..machine(false) };
-        let only_rust = lines(&Task::Test(vec![TestPart::Rust, TestPart::Protocol]), &bare);
+        let only_rust = lines(&ProjectTask::Test(vec![TestPart::Rust, TestPart::Protocol]), &bare);
         assert_eq!(only_rust.len(), 4, "{only_rust:?}");
         assert!(only_rust[0] == WORKSPACE && only_rust[3].contains("cargo test --release"), "{only_rust:?}");
-        assert_eq!(lines(&Task::Test(vec![TestPart::Protocol]), &bare).len(), 2, "the generator builds by itself");
+        assert_eq!(
+            lines(&ProjectTask::Test(vec![TestPart::Protocol]), &bare).len(),
+            2,
+            "the generator builds by itself"
+        );
         for (part, missing) in [
             (TestPart::Viewer, "Node.js"),
             (TestPart::Python, "Python"),
             (TestPart::Documents, "Python"),
             (TestPart::Abi, "POSIX"),
         ] {
-            let failure = plan(&Task::Test(vec![part]), &bare).unwrap_err();
+            let failure = plan(&ProjectTask::Test(vec![part]), &bare).unwrap_err();
             assert_eq!(failure.status(), 3);
             assert!(failure.to_string().contains(missing), "{failure}");
         }
@@ -369,23 +373,26 @@ mod tests {
 
     #[test]
     fn the_python_environment_is_made_once() {
-        let first = lines(&Task::Test(vec![TestPart::Documents]), &machine(true));
+        let first = lines(&ProjectTask::Test(vec![TestPart::Documents]), &machine(true));
         assert_eq!(first[1], "python -m venv target/venv");
         assert!(first[2].starts_with("target/venv/Scripts/python.exe -m pip install"), "{first:?}");
         assert_eq!(first[3], "# marks target/venv/ready");
-        assert_eq!(lines(&Task::Test(vec![TestPart::Documents]), &built(true)).len(), 2);
+        assert_eq!(lines(&ProjectTask::Test(vec![TestPart::Documents]), &built(true)).len(), 2);
     }
 
     #[test]
     fn lint_and_page_need_node_and_install_its_packages_first() {
-        let lint = lines(&Task::Lint, &machine(false));
+        let lint = lines(&ProjectTask::Lint, &machine(false));
         assert_eq!(lint[1], "python3 tests/counts.py");
         assert_eq!(lint[2], "cargo clippy --release --workspace --all-targets -- -D warnings");
         let install = lint.iter().position(|line| line == "(in clients) npm ci").unwrap();
         assert!(lint[install + 1..].iter().all(|line| line.ends_with("npm run lint")) && lint.len() == install + 3);
-        assert_eq!(lines(&Task::Page, &machine(false)), ["(in clients) npm ci", "(in clients/viewer) npm run build"]);
-        assert_eq!(lines(&Task::Page, &built(false)), [""; 0]);
-        for task in [Task::Lint, Task::Page] {
+        assert_eq!(
+            lines(&ProjectTask::Page, &machine(false)),
+            ["(in clients) npm ci", "(in clients/viewer) npm run build"]
+        );
+        assert_eq!(lines(&ProjectTask::Page, &built(false)), [""; 0]);
+        for task in [ProjectTask::Lint, ProjectTask::Page] {
             assert_eq!(plan(&task, &System { has_node: false, ..built(false) }).unwrap_err().status(), 3);
         }
     }

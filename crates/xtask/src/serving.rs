@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader};
 use std::process::{ChildStdout, Stdio};
 
-use crate::execute::{Failure, command, run};
+use crate::execute::{TaskFailure, command, run};
 use crate::interrupt;
 use crate::plan::Step;
 
@@ -11,13 +11,13 @@ use crate::plan::Step;
 ///
 /// # Errors
 /// Returns an error if the server does not start, the poke fails, or the server ends otherwise than by Ctrl-C.
-pub(crate) fn serve(server: &Step, poke: &Step) -> Result<(), Failure> {
-    let folder = |error| Failure::Failed(format!("can't make the folder `target` for the records: {error}"));
+pub(crate) fn serve(server: &Step, poke: &Step) -> Result<(), TaskFailure> {
+    let folder = |error| TaskFailure::Failed(format!("can't make the folder `target` for the records: {error}"));
     std::fs::create_dir_all("target").map_err(folder)?;
     let mut starting = command(server)?;
     starting.stdin(Stdio::null()).stdout(Stdio::piped());
-    let mut child =
-        interrupt::start(starting).map_err(|error| Failure::Failed(format!("`{server}` did not start: {error}")))?;
+    let mut child = interrupt::start(starting)
+        .map_err(|error| TaskFailure::Failed(format!("`{server}` did not start: {error}")))?;
     let told = child.stdout.take().and_then(|output| {
         let mut output = BufReader::new(output);
         url(&mut output).map(|url| (url, output))
@@ -26,7 +26,7 @@ pub(crate) fn serve(server: &Step, poke: &Step) -> Result<(), Failure> {
         let ended = interrupt::wait(&mut child);
         let reason = "No server, so nothing to see. Another port: cargo xtask run --listen 127.0.0.1:0";
         // Ctrl-C before it listens.
-        return if ended { Ok(()) } else { Err(Failure::Failed(reason.to_owned())) };
+        return if ended { Ok(()) } else { Err(TaskFailure::Failed(reason.to_owned())) };
     };
     let mut poke = poke.clone();
     poke.arguments.extend(["--server".to_owned(), url.clone()]);
@@ -36,7 +36,7 @@ pub(crate) fn serve(server: &Step, poke: &Step) -> Result<(), Failure> {
     }
     println!("\nThe records are in target/poke.jsonl. Serving until Ctrl-C. To touch the tissue, open\n\n    {url}\n");
     drain(output);
-    if interrupt::wait(&mut child) { Ok(()) } else { Err(Failure::Failed(format!("`{server}` failed"))) }
+    if interrupt::wait(&mut child) { Ok(()) } else { Err(TaskFailure::Failed(format!("`{server}` failed"))) }
 }
 
 /// Returns the address in the first line with one; `None` if the output ends before it.

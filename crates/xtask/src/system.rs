@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::SystemTime;
 
-use crate::execute::Failure;
+use crate::execute::TaskFailure;
 
 /// The facts on which a plan depends.
 #[derive(Debug, Clone)]
@@ -36,10 +36,10 @@ impl System {
     ///
     /// # Errors
     /// Returns an error if the folder of the sources does not exist any more.
-    pub(crate) fn find() -> Result<Self, Failure> {
+    pub(crate) fn find() -> Result<Self, TaskFailure> {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
         let moved =
-            |error| Failure::Failed(format!("can't enter the folder of the sources, {}: {error}", root.display()));
+            |error| TaskFailure::Failed(format!("can't enter the folder of the sources, {}: {error}", root.display()));
         std::env::set_current_dir(&root).map_err(moved)?;
         let is_windows = cfg!(windows);
         let named = |name: &str, otherwise: &str| {

@@ -8,12 +8,12 @@ use pb::haptic_service_client::HapticServiceClient;
 use tonic::{Status, Streaming};
 
 use super::FoxgloveArguments;
-use super::topics::{RestSurface, Topics};
+use super::topics::{RestVertices, Topics};
 use crate::{ClientFailure, interrupted, warn};
 
 /// What is watched of a session.
 struct WatchedSession {
-    rest: RestSurface,
+    rest: RestVertices,
     frames: Frames,
     samples: Samples,
     records: Streaming<pb::ProbeResponse>,
@@ -22,7 +22,7 @@ struct WatchedSession {
 impl WatchedSession {
     /// Starts to watch a session, with a sample and a record every `every_steps`.
     async fn open(channel: Channel, session_id: String, every_steps: u32, frames_hz: f64) -> Result<Self, Status> {
-        let rest = RestSurface::get(channel.clone(), &session_id).await?;
+        let rest = RestVertices::get(channel.clone(), &session_id).await?;
         let request =
             pb::WatchFramesRequest { session_id: session_id.clone(), rate_hz: Some(frames_hz), ..Default::default() };
         let frames = Frames::open(channel.clone(), request).await?;

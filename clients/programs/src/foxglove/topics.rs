@@ -27,7 +27,7 @@ const MAX_VERTICES: usize = 1 << 24;
 
 /// The vertices of a session's surface at rest, in the order of frames.
 #[derive(Default)]
-pub(super) struct RestSurface {
+pub(super) struct RestVertices {
     /// Position of each vertex, m.
     rest_m: Vec<[f32; 3]>,
     /// Number of vertices along y of a sheet.
@@ -36,7 +36,7 @@ pub(super) struct RestSurface {
     of_file_vertex: HashMap<u32, usize>,
 }
 
-impl RestSurface {
+impl RestVertices {
     /// Gets the surface of a session.
     ///
     /// # Errors
@@ -44,7 +44,7 @@ impl RestSurface {
     pub(super) async fn get(channel: palpate_client::Channel, session_id: &str) -> Result<Self, Status> {
         let request = pb::GetMeshRequest { session_id: session_id.to_owned(), refinement: 0 };
         let mut parts = ViewServiceClient::new(channel).get_mesh(request).await?.into_inner();
-        let mut surface = RestSurface::default();
+        let mut surface = RestVertices::default();
         while let Some(part) = parts.message().await? {
             surface.rest_m.extend_from_slice(part.rest_position_m.as_chunks().0);
             surface.vertices_y = part.vertices_y as usize;
@@ -122,7 +122,7 @@ impl Topics {
     }
 
     /// Sends the points of a frame.
-    pub(super) fn frame(&mut self, rest: &RestSurface, surface: &SurfaceState) {
+    pub(super) fn frame(&mut self, rest: &RestVertices, surface: &SurfaceState) {
         let moved = surface.displacement_m.iter().map(|moved_m| moved_m.map(f64::from));
         let lengths = moved.clone().map(|moved_m| DVec3::from(moved_m).length());
         // A frame may have more vertices than the surface.
@@ -174,7 +174,7 @@ impl Topics {
     ///
     /// # Errors
     /// Returns why a tool has no topic.
-    pub(super) fn sample(&mut self, rest: &RestSurface, sample: &pb::Sample) -> Result<(), String> {
+    pub(super) fn sample(&mut self, rest: &RestVertices, sample: &pb::Sample) -> Result<(), String> {
         for tool in &sample.tools {
             let Some(rest_m) = rest.control_point_m(tool).filter(|_| !self.posed.contains(&tool.tool)) else {
                 continue;

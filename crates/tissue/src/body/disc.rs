@@ -9,10 +9,11 @@ use crate::shape::PointId;
 use palpate_refusal::Result;
 
 /// The disc of a tool on a kind of tissue, at a place of the rest surface. `body::footprint` asks it which points it
-/// covers, and computes everything else. All directions along the surface are those of [`Disc::cover`]'s gradients.
-pub(crate) trait Disc: fmt::Debug + Send + Sync {
+/// covers, and computes everything else. All directions along the surface are those of the gradients of
+/// [`TissueDisc::cover`].
+pub(crate) trait TissueDisc: fmt::Debug + Send + Sync {
     /// Returns a copy.
-    fn boxed(&self) -> Box<dyn Disc>;
+    fn boxed(&self) -> Box<dyn TissueDisc>;
 
     /// Returns the place as plain data.
     fn saved(&self) -> SavedPlace;
@@ -23,7 +24,7 @@ pub(crate) trait Disc: fmt::Debug + Send + Sync {
     /// Refuses a place that is not on this tissue.
     fn restore(&mut self, saved: &SavedPlace) -> Result<()>;
 
-    /// Moves back to an earlier place ([`Disc::saved`]). Returns whether the covered points may be others.
+    /// Moves back to an earlier place ([`TissueDisc::saved`]). Returns whether the covered points may be others.
     fn return_to(&mut self, saved: &SavedPlace) -> bool;
 
     /// Returns the rest position of the place, m.
@@ -69,8 +70,8 @@ pub(crate) trait Disc: fmt::Debug + Send + Sync {
         1.0
     }
 
-    /// Returns the weight of a movable point, which need not be covered; `None` if the points of [`Disc::cover`] are in
-    /// the order of memory, so that a search among them finds it.
+    /// Returns the weight of a movable point, which need not be covered; `None` if the points of [`TissueDisc::cover`]
+    /// are in the order of memory, so that a search among them finds it.
     fn weight_of(&self, _point: PointId) -> Option<f64> {
         None
     }

@@ -15,7 +15,7 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::body::disc::Disc;
+use crate::body::disc::TissueDisc;
 use crate::body::disc_on;
 use crate::body::model::Model;
 use crate::saved::{SavedPlace, ensure};
@@ -33,7 +33,7 @@ const FIXED_PART: f64 = 0.02;
 #[derive(Debug)]
 pub struct Footprint {
     radius_m: f64,
-    disc: Box<dyn Disc>,
+    disc: Box<dyn TissueDisc>,
     reached: Vec<WeightedNode>,
     /// Factor of the weights of movable points ([`MIN_FREE_PART`]).
     free_factor: f64,

@@ -61,7 +61,7 @@ impl ForceChange {
 
 /// Forces with the same falloff: a weighted sum for each of the scheme's fields, N.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Wanted {
+pub(crate) struct FalloffForces {
     /// Defines the falloff; its force vector is not used.
     pub(crate) poke: Poke,
     pub(crate) forces_n: [DVec3; 3],
@@ -70,7 +70,7 @@ pub(crate) struct Wanted {
 /// A force over the points: a vector times e^{−c·r}.
 #[derive(Debug, Clone)]
 pub(crate) struct Term<T: Real> {
-    pub(crate) wanted: Wanted,
+    pub(crate) wanted: FalloffForces,
     /// e^{c′}.
     gain: f64,
     /// The force in each of the scheme's fields, in the scheme's units.
@@ -99,7 +99,7 @@ impl<T: Real> Term<T> {
         let poke =
             Poke { point: None, centre_m: DVec3::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
         Term {
-            wanted: Wanted { poke, forces_n: [DVec3::ZERO; 3] },
+            wanted: FalloffForces { poke, forces_n: [DVec3::ZERO; 3] },
             gain: 1.0,
             forces: [[T::default(); 3]; 3],
             rows: 0..0,
@@ -124,7 +124,7 @@ impl<T: Real> Term<T> {
         model.places.fall_off(Width::of(model.lanes), poke, layout, points, &mut self.factors, &mut self.spans);
     }
 
-    pub(crate) fn set(&mut self, wanted: Wanted, scale: f64) {
+    pub(crate) fn set(&mut self, wanted: FalloffForces, scale: f64) {
         self.forces = wanted.forces_n.map(|force_n| (self.gain * scale * force_n).to_array().map(T::of));
         self.wanted = wanted;
     }

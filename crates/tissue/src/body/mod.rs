@@ -24,14 +24,14 @@ use crate::scene::graph::GraphFault;
 use crate::scene::profile::Poke;
 use crate::scene::{Body, Scene, Sheet};
 use crate::shape::{self, PointId};
-use disc::Disc;
+use disc::TissueDisc;
 use sheet::falloff::SheetPoints;
 use sheet::footprint::GridDisc;
 use surface::footprint::MeshDisc;
 use surface::{MeshPlaces, VolumePlaces};
 
 /// Returns a disc of `radius_m` (m) on a tissue, at an arbitrary place: the list of the kinds' discs.
-pub(crate) fn disc_on(body: &Body, radius_m: f64) -> Box<dyn Disc> {
+pub(crate) fn disc_on(body: &Body, radius_m: f64) -> Box<dyn TissueDisc> {
     match body {
         Body::Sheet(sheet) => Box::new(GridDisc::new(sheet, radius_m)),
         Body::Mesh(mesh) => Box::new(MeshDisc::new(&mesh.shape, radius_m)),

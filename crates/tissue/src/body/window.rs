@@ -13,10 +13,7 @@ pub(crate) const REACHES: f64 = 6.0;
 /// Memory of a point of a patch with six springs, and of the vectors of a solution. The work of a force law is
 /// bounded, and so is its memory: 20 MB for the 116² points that 2^27 springs times iterations allow.
 const BYTES_PER_POINT: usize =
-    6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
-
-/// Three vectors per point: one of each system.
-pub(crate) type Triple = [DVec3; 3];
+    6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<[DVec3; 3]>() + 16;
 
 /// A spring of the part, linearised at the present displacements.
 #[derive(Debug, Clone, Copy)]

@@ -209,12 +209,16 @@ impl<T: Real> Clone for Field<T> {
 
 impl<T> Deref for Field<T> {
     type Target = [T];
+
+    // Not inlined, each access to a value is a call: a tool's contact accesses thousands.
+    #[inline]
     fn deref(&self) -> &[T] {
         &self.storage[self.from..self.from + self.length]
     }
 }
 
 impl<T> DerefMut for Field<T> {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [T] {
         &mut self.storage[self.from..self.from + self.length]
     }

@@ -11,7 +11,7 @@
 //! make it indefinite. The pressure of a volume adds κ/V0·a·aᵀ over all points: those far away are held too, so
 //! κ is reduced by what they would yield ([`volume_compliance`]). The solver is conjugate gradients (Hestenes
 //! and Stiefel, Journal of Research of the National Bureau of Standards 49(6), 1952, doi:10.6028/jres.049.044),
-//! the three systems side by side, preconditioned by the points' own blocks. Points too far away to notice are
+//! all systems side by side, preconditioned by the points' own blocks. Points too far away to notice are
 //! held: a press reaches √(k/K″) spacings.
 
 use std::cell::Cell;
@@ -22,7 +22,7 @@ use glam::{DMat3, DQuat, DVec3};
 use crate::body::MemoryLayout;
 use crate::body::footprint::{Footprint, WeightedNode};
 use crate::body::model::Model;
-use crate::body::window::{Spring, Triple, Window};
+use crate::body::window::{Spring, Window};
 use crate::memory;
 
 /// The accuracy of a solution: the bounds at which the solvers stop.
@@ -245,21 +245,23 @@ impl<'m> LinearPatch<'m> {
         }
     }
 
-    /// Writes K·x for three vectors at once to `product`.
-    fn times(&self, x: &[Triple], product: &mut [Triple]) {
+    /// Writes K·x for `N` vectors at once to `product`.
+    fn times<const N: usize>(&self, x: &[[DVec3; N]], product: &mut [[DVec3; N]]) {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         for ((product, x), part) in product.iter_mut().zip(x).zip(&self.stiffness) {
-            *product = x.map(|x| own * part * x);
+            for system in 0..N {
+                product[system] = own * part * x[system];
+            }
         }
         for Spring { ends: [a, b], tangent, .. } in &self.springs {
-            for system in 0..3 {
+            for system in 0..N {
                 let pull = *tangent * (x[*b][system] - x[*a][system]);
                 product[*a][system] -= pull;
                 product[*b][system] += pull;
             }
         }
         if let Some(pressure) = &self.pressure {
-            for system in 0..3 {
+            for system in 0..N {
                 let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(x.iter().map(|x| &x[system]));
                 for (product, area) in product.iter_mut().zip(&pressure.areas_m2) {
                     product[system] += pushed_pa * *area;
@@ -268,35 +270,34 @@ impl<'m> LinearPatch<'m> {
         }
         for (product, free) in product.iter_mut().zip(&self.free) {
             if !free {
-                *product = [DVec3::ZERO; 3];
+                *product = [DVec3::ZERO; N];
             }
         }
     }
 
-    /// Solves K·x = `right` for three systems, to a relative residual of `good`. Also returns the iterations of
-    /// the slowest.
-    fn solve(&self, right: &[Triple], good: f64) -> (Vec<Triple>, u32) {
-        let dot = |a: &[Triple], b: &[Triple]| {
-            let mut sum = [0.0; 3];
-            for (a, b) in a.iter().zip(b) {
-                (0..3).for_each(|system| sum[system] += a[system].dot(b[system]));
+    /// Writes the residual divided by the points' own blocks to `z`.
+    fn precondition<const N: usize>(&self, residual: &[[DVec3; N]], z: &mut [[DVec3; N]]) {
+        for ((z, residual), inverse) in z.iter_mut().zip(residual).zip(&self.inverses) {
+            for system in 0..N {
+                z[system] = *inverse * residual[system];
             }
-            sum
-        };
-        let masked = |triple: &Triple, free: bool| if free { *triple } else { [DVec3::ZERO; 3] };
-        let mut residual: Vec<Triple> = right.iter().zip(&self.free).map(|(r, free)| masked(r, *free)).collect();
+        }
+    }
+
+    /// Solves K·x = `right` for `N` systems side by side, to a relative residual of `good`. Also returns the
+    /// iterations of the slowest.
+    fn solve<const N: usize>(&self, right: &[[DVec3; N]], good: f64) -> (Vec<[DVec3; N]>, u32) {
+        let zero = || vec![[DVec3::ZERO; N]; right.len()];
+        let (mut x, mut z, mut product) = (zero(), zero(), zero());
+        let masked = |(right, free): (&[DVec3; N], &bool)| if *free { *right } else { [DVec3::ZERO; N] };
+        let mut residual: Vec<[DVec3; N]> = right.iter().zip(&self.free).map(masked).collect();
         let whole = dot(&residual, &residual);
-        let precondition = |residual: &[Triple]| -> Vec<Triple> {
-            residual.iter().zip(&self.inverses).map(|(r, inverse)| r.map(|r| *inverse * r)).collect()
-        };
-        let mut x = vec![[DVec3::ZERO; 3]; residual.len()];
-        let mut z = precondition(&residual);
+        self.precondition(&residual, &mut z);
         let mut direction = z.clone();
-        let mut product = x.clone();
         let mut rz = dot(&residual, &z);
         for iteration in 0..MAX_ITERATIONS {
             let left = dot(&residual, &residual);
-            if (0..3).all(|system| left[system] <= good * good * whole[system]) {
+            if (0..N).all(|system| left[system] <= good * good * whole[system]) {
                 return (x, iteration);
             }
             if !self.allowance.take(self.springs.len()) {
@@ -304,19 +305,19 @@ impl<'m> LinearPatch<'m> {
             }
             self.times(&direction, &mut product);
             let curvature = dot(&direction, &product);
-            let step: [f64; 3] = std::array::from_fn(|s| if curvature[s] > 0.0 { rz[s] / curvature[s] } else { 0.0 });
-            for at in 0..x.len() {
-                for s in 0..3 {
-                    x[at][s] += step[s] * direction[at][s];
-                    residual[at][s] -= step[s] * product[at][s];
+            let step: [f64; N] = std::array::from_fn(|s| if curvature[s] > 0.0 { rz[s] / curvature[s] } else { 0.0 });
+            for (((x, residual), direction), product) in x.iter_mut().zip(&mut residual).zip(&direction).zip(&product) {
+                for s in 0..N {
+                    x[s] += step[s] * direction[s];
+                    residual[s] -= step[s] * product[s];
                 }
             }
-            z = precondition(&residual);
+            self.precondition(&residual, &mut z);
             let next = dot(&residual, &z);
+            let turn: [f64; N] = std::array::from_fn(|s| if rz[s] > 0.0 { next[s] / rz[s] } else { 0.0 });
             for (direction, z) in direction.iter_mut().zip(&z) {
-                for s in 0..3 {
-                    let turn = if rz[s] > 0.0 { next[s] / rz[s] } else { 0.0 };
-                    direction[s] = z[s] + turn * direction[s];
+                for s in 0..N {
+                    direction[s] = z[s] + turn[s] * direction[s];
                 }
             }
             rz = next;
@@ -328,7 +329,7 @@ impl<'m> LinearPatch<'m> {
     /// of conjugate gradients for three systems side by side.
     pub fn tangent(&self) -> Tangent {
         let axes = [DVec3::X, DVec3::Y, DVec3::Z];
-        let right: Vec<Triple> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
+        let right: Vec<[DVec3; 3]> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
         let (shapes, iterations) = self.solve(&right, self.accuracy.residual);
         let compliance = |a: usize, b: usize| -> f64 {
             self.weights.iter().zip(&shapes).map(|(weight, shape)| weight * shape[b][a]).sum()
@@ -355,12 +356,12 @@ impl<'m> LinearPatch<'m> {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         let mut force_n = 0.0;
         for _ in 0..MAX_NEWTON {
-            let mut right: Vec<Triple> = self
+            let mut right: Vec<[DVec3; 2]> = self
                 .displacement_m
                 .iter()
                 .zip(&self.weights)
                 .zip(&self.stiffness)
-                .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z, DVec3::ZERO])
+                .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z])
                 .collect();
             for spring in &self.springs {
                 right[spring.ends[0]][0] += spring.force_n;
@@ -408,9 +409,20 @@ pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
     let patch = LinearPatch::weighted(model, vec![0.0; window.len()], window, zero, &DMat3::IDENTITY);
     let patch = LinearPatch { pressure: None, allowance: Allowance::of(YIELDING, stop), ..patch };
     let area_m2 = |slot: usize| volume.areas[slot] * unit_m2;
-    let pushed: Vec<Triple> = (0..model.len()).map(|slot| [area_m2(slot), DVec3::ZERO, DVec3::ZERO]).collect();
+    let pushed: Vec<[DVec3; 1]> = (0..model.len()).map(|slot| [area_m2(slot)]).collect();
     let (moved, _) = patch.solve(&pushed, Accuracy::COARSE.residual);
-    moved.iter().enumerate().map(|(slot, [moved_m, ..])| moved_m.dot(area_m2(slot))).collect()
+    moved.iter().enumerate().map(|(slot, [moved_m])| moved_m.dot(area_m2(slot))).collect()
+}
+
+/// Returns the scalar products of `N` pairs of vectors, summed in the order of the points.
+fn dot<const N: usize>(a: &[[DVec3; N]], b: &[[DVec3; N]]) -> [f64; N] {
+    let mut sum = [0.0; N];
+    for (a, b) in a.iter().zip(b) {
+        for system in 0..N {
+            sum[system] += a[system].dot(b[system]);
+        }
+    }
+    sum
 }
 
 /// Largest number of steps of Newton's method for one depth.

@@ -10,7 +10,7 @@
 
 use glam::DVec3;
 
-use crate::body::force_field::{ForceChange, Term, Wanted, factor, same_falloff};
+use crate::body::force_field::{FalloffForces, ForceChange, Term, factor, same_falloff};
 use crate::body::model::{Model, Plan};
 use crate::kernel::field::Layout;
 use crate::kernel::real::Real;
@@ -72,7 +72,7 @@ pub(crate) struct Applied<T: Real> {
     /// The terms that act in the present substep.
     pub(crate) terms: Vec<Term<T>>,
     /// The terms before they have tables. Kept, so that a step allocates nothing.
-    wanted: Vec<Wanted>,
+    wanted: Vec<FalloffForces>,
     /// Whether the terms stay valid for the next steps.
     settled: bool,
 }
@@ -136,7 +136,8 @@ impl<T: Real> Applied<T> {
         let slots = saved.slots.iter().map(slot).collect::<Result<_>>()?;
         let mut terms = Vec::new();
         for saved in &saved.terms {
-            let wanted = Wanted { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
+            let wanted =
+                FalloffForces { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
             // A force of 0 needs a finite factor too: the sweep multiplies.
             ensure(libm::exp(wanted.poke.falloff_offset).is_finite(), "a force that is not finite")?;
             is_sound(&wanted.poke, &wanted.forces_n)?;
@@ -199,7 +200,7 @@ impl<T: Real> Applied<T> {
                     Some(wanted) if same_falloff(&wanted.poke, &poke) => {
                         wanted.forces_n.iter_mut().zip(forces_n).for_each(|(sum, force)| *sum += force);
                     }
-                    _ => self.wanted.push(Wanted { poke: Poke { force_n: DVec3::ZERO, ..poke }, forces_n }),
+                    _ => self.wanted.push(FalloffForces { poke: Poke { force_n: DVec3::ZERO, ..poke }, forces_n }),
                 }
             };
             for node in &plan.nodes {
@@ -246,7 +247,7 @@ impl<T: Real> Applied<T> {
         let term = |poke: Poke| {
             let mut term = Term::new();
             term.place(&poke, model, layout);
-            term.set(Wanted { poke, forces_n: [poke.force_n; 3] }, scale);
+            term.set(FalloffForces { poke, forces_n: [poke.force_n; 3] }, scale);
             term
         };
         pokes.map(term).collect()

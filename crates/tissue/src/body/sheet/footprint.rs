@@ -18,7 +18,7 @@ use std::sync::OnceLock;
 
 use glam::{DVec2, DVec3};
 
-use crate::body::disc::Disc;
+use crate::body::disc::TissueDisc;
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::Sheet;
 use crate::shape::PointId;
@@ -146,8 +146,8 @@ fn place_of(saved: &SavedPlace) -> Option<DVec2> {
     if let SavedPlace::OfPlane(centre_m) = saved { Some(DVec2::from(*centre_m)) } else { None }
 }
 
-impl Disc for GridDisc {
-    fn boxed(&self) -> Box<dyn Disc> {
+impl TissueDisc for GridDisc {
+    fn boxed(&self) -> Box<dyn TissueDisc> {
         Box::new(self.clone())
     }
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
-use crate::body::disc::Disc;
+use crate::body::disc::TissueDisc;
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::MeshShape;
 use crate::shape::PointId;
@@ -44,8 +44,8 @@ impl MeshDisc {
     }
 }
 
-impl Disc for MeshDisc {
-    fn boxed(&self) -> Box<dyn Disc> {
+impl TissueDisc for MeshDisc {
+    fn boxed(&self) -> Box<dyn TissueDisc> {
         Box::new(self.clone())
     }
 

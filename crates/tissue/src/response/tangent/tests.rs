@@ -78,7 +78,7 @@ fn the_linearised_springs_have_the_springs_forces_and_their_derivative() {
     let truth = forces_n(&model, &patch.displacement_m);
     assert!(found.iter().zip(&truth).all(|(found, truth)| found.distance(*truth) < 1e-12));
     // K·x is the change of the force against a small movement along x.
-    let x: Vec<Triple> =
+    let x: Vec<[DVec3; 3]> =
         (0..model.len()).map(|at| [0, 40, 80].map(|more| scattered([at + more, 2 * at + 1]))).collect();
     let mut product = vec![[DVec3::ZERO; 3]; x.len()];
     patch.times(&x, &mut product);
@@ -100,7 +100,7 @@ fn a_solution_leaves_no_more_than_the_part_it_may_of_any_load() {
     let patch = patch(&model, 1.0, stretched(model.scene.sheet().unwrap().spacing_m));
     // A faint load is solved as exactly as a strong one.
     for size in [1e-9, 1.0] {
-        let load: Vec<Triple> =
+        let load: Vec<[DVec3; 3]> =
             (0..model.len()).map(|at| [0, 40, 80].map(|more| size * scattered([at + more, at]))).collect();
         let (x, iterations) = patch.solve(&load, 1e-8);
         let mut left = vec![[DVec3::ZERO; 3]; x.len()];
