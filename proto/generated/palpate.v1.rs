@@ -2326,17 +2326,20 @@ pub struct Scene {
     /// Any name, for people.
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
-    /// The grid of mass points. Either this or `mesh` is required.
+    /// The grid of mass points. This, `mesh` or `solid` is required.
     #[prost(message, optional, tag = "2")]
     pub sheet: ::core::option::Option<Sheet>,
     /// The triangle mesh whose vertices are the mass points, instead of `sheet`.
     #[prost(message, optional, tag = "8")]
     pub mesh: ::core::option::Option<Mesh>,
+    /// Cubes that fill a closed surface, instead of `sheet`: a tissue with an inside. Its material is in it.
+    #[prost(message, optional, tag = "12")]
+    pub solid: ::core::option::Option<Solid>,
     /// The material of a tissue on a mesh, instead of the coefficients below.
     #[prost(message, optional, tag = "9")]
     pub material: ::core::option::Option<Material>,
-    /// Regions of a mesh that are stiffer or softer: at most 256, and at most 8 million in total over the simulated
-    /// vertices. Where they overlap, their factors multiply.
+    /// Regions of a mesh or solid that are stiffer or softer: at most 256, and on a mesh at most 8 million in total over
+    /// the simulated vertices. Where they overlap, their factors multiply. Those of a solid are balls.
     #[prost(message, repeated, tag = "10")]
     pub inclusions: ::prost::alloc::vec::Vec<Inclusion>,
     /// Springs between neighbours. Required without `material`.
@@ -2453,6 +2456,104 @@ impl ::prost::Name for Mesh {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Mesh".into()
+    }
+}
+/// A tissue with an inside: a lattice of cubes that fills a closed surface. The corners of the cubes are the mass points;
+/// frames show the surface. A client sends no `springs`, `anchor_springs` and `damping` with it. A server sends them,
+/// including changes by UpdateTissue: the k of `springs` is E times the edge of a cube, and C is that of a full cube.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Solid {
+    /// Id of the mesh of the surface, which the client has uploaded (`UploadMesh`). Required in a scene that a client
+    /// sends; empty in scenes that a server sends.
+    #[prost(string, tag = "1")]
+    pub mesh_id: ::prost::alloc::string::String,
+    /// Edge of a cube, m; above 0. Absent: it follows from `cells`. A server sends it always.
+    #[prost(double, optional, tag = "2")]
+    pub cell_m: ::core::option::Option<f64>,
+    /// Number of cubes, approximately; at least 1. 20,000 if `cell_m` is absent too.
+    #[prost(uint32, optional, tag = "3")]
+    pub cells: ::core::option::Option<u32>,
+    /// Parts whose points never move; at least one.
+    #[prost(message, repeated, tag = "4")]
+    pub fixed: ::prost::alloc::vec::Vec<FixedPart>,
+    /// E, Young's modulus, Pa; above 0. Required.
+    #[prost(double, optional, tag = "5")]
+    pub youngs_modulus_pa: ::core::option::Option<f64>,
+    /// ν, Poisson's ratio; 0 to 0.495. Required.
+    #[prost(double, optional, tag = "6")]
+    pub poissons_ratio: ::core::option::Option<f64>,
+    /// ρ, density, kg/m³; above 0. 1060 if absent.
+    #[prost(double, optional, tag = "7")]
+    pub density_kg_per_m3: ::core::option::Option<f64>,
+    /// Damping: the force −c·m·v on a mass m, 1/s; 0 or more. 20 if absent.
+    #[prost(double, optional, tag = "8")]
+    pub damping_per_s: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Solid {
+    const NAME: &'static str = "Solid";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Solid".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Solid".into()
+    }
+}
+/// A part of space whose points of a solid never move.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FixedPart {
+    /// Required.
+    #[prost(oneof = "fixed_part::Part", tags = "1, 2, 3")]
+    pub part: ::core::option::Option<fixed_part::Part>,
+}
+/// Nested message and enum types in `FixedPart`.
+pub mod fixed_part {
+    /// Required.
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        /// The points near a plane.
+        #[prost(message, tag = "1")]
+        Plane(super::FixedPlane),
+        /// The points within a ball.
+        #[prost(message, tag = "2")]
+        Ball(super::Ball),
+        /// The points that move most with the vertices of a group of the mesh.
+        #[prost(string, tag = "3")]
+        Group(::prost::alloc::string::String),
+    }
+}
+impl ::prost::Name for FixedPart {
+    const NAME: &'static str = "FixedPart";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.FixedPart".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.FixedPart".into()
+    }
+}
+/// The points of a solid within a distance of a plane; at least one layer of them, so that a plane between two layers
+/// fixes both.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct FixedPlane {
+    /// A place of the plane, m. Required.
+    #[prost(message, optional, tag = "1")]
+    pub plane_m: ::core::option::Option<Vector3>,
+    /// The direction across the plane, of any length above 0. Required.
+    #[prost(message, optional, tag = "2")]
+    pub normal: ::core::option::Option<Vector3>,
+    /// The distance, m; 0 or more.
+    #[prost(double, tag = "3")]
+    pub within_m: f64,
+}
+impl ::prost::Name for FixedPlane {
+    const NAME: &'static str = "FixedPlane";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.FixedPlane".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.FixedPlane".into()
     }
 }
 /// The material of a tissue on a mesh. Masses, k, K″ and C follow from it by the area around each vertex. With it, a

@@ -28,12 +28,15 @@ pub const MESH_ID: &str = "scene.mesh.mesh_id";
 /// Returns the ID of the mesh that belongs to a scene besides its message, and that a client sends before it: empty if it
 /// has none yet. `None` if the message describes the whole tissue.
 pub fn mesh_id(scene: &pb::Scene) -> Option<&str> {
-    scene.mesh.as_ref().map(|mesh| mesh.mesh_id.as_str())
+    let of_solid = scene.solid.as_ref().map(|solid| solid.mesh_id.as_str());
+    scene.mesh.as_ref().map(|mesh| mesh.mesh_id.as_str()).or(of_solid)
 }
 
 /// Sets the ID of the mesh that belongs to a scene, if one does.
 pub fn set_mesh_id(scene: &mut pb::Scene, id: String) {
     if let Some(mesh) = &mut scene.mesh {
         mesh.mesh_id = id;
+    } else if let Some(solid) = &mut scene.solid {
+        solid.mesh_id = id;
     }
 }

@@ -51,9 +51,10 @@ impl Sessions {
         let payer = account.clone();
         let source = request.source;
         let mesh = match &source {
-            Some(Source::Scene(pb::Scene { mesh: Some(mesh), .. })) => {
-                Some(self.0.meshes.get(&mesh.mesh_id, &account)?)
-            }
+            Some(Source::Scene(scene)) => match palpate_proto::scene::mesh_id(scene) {
+                Some(mesh_id) => Some(self.0.meshes.get(mesh_id, &account)?),
+                None => None,
+            },
             _ => None,
         };
         let (catalog, config, recorded) = (self.0.catalog.clone(), self.0.config.clone(), self.0.recorded.clone());

@@ -7,6 +7,8 @@ type Group = (typeof GROUPS)[number];
 
 const KNOWN: Record<string, [title: string, group: Group]> = {
   "liver-organ": ["Liver with two lumps", "Organs"],
+  "liver-solid": ["Liver with an inside", "Organs"],
+  kidney: ["Kidney with an inside", "Organs"],
   colon: ["Colon", "Organs"],
   gallbladder: ["Gallbladder", "Organs"],
   liver: ["Liver", "Slabs of tissue"],

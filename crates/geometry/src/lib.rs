@@ -4,6 +4,7 @@
 mod curvature;
 pub mod decimate;
 pub mod delaunay;
+pub mod fill;
 pub mod format;
 mod join;
 pub mod mesh;
@@ -15,6 +16,7 @@ mod ray;
 pub mod read;
 pub mod repair;
 pub mod report;
+pub mod subdivide;
 pub mod surface;
 pub mod top;
 pub mod topology;

@@ -408,6 +408,8 @@ const HALVINGS: u32 = 16;
 pub struct SurfaceDisc {
     radius_m: f64,
     edge_m: f64,
+    /// Whether hats are averaged over the whole disc.
+    is_whole: bool,
     /// ρ: radius of the disc over which hats are averaged at the present position.
     drawn_m: f64,
     directions: Vec<DVec2>,
@@ -476,6 +478,7 @@ impl SurfaceDisc {
         SurfaceDisc {
             radius_m,
             edge_m,
+            is_whole: false,
             drawn_m: radius_m,
             directions: (0..count).map(direction).collect(),
             crossings: Vec::new(),
@@ -485,6 +488,12 @@ impl SurfaceDisc {
             found: vec![(NONE, 0); 64],
             widening: Vec::new(),
         }
+    }
+
+    /// Creates a disc as [`SurfaceDisc::new`] does, whose hats are averaged over the whole disc: its area is not matched. So
+    /// its weights are those of an even pressure.
+    pub fn whole(radius_m: f64, edge_m: f64) -> Self {
+        SurfaceDisc { is_whole: true, ..Self::new(radius_m, edge_m) }
     }
 
     /// Estimates how many triangles the paths of a disc of `radius_m` (m) cross, on a surface whose edges are about
@@ -527,8 +536,8 @@ impl SurfaceDisc {
     /// Lays the disc on `place` of `surface`, which replaces its position and [`SurfaceDisc::covered`]. Finds the
     /// radius ρ over which hats are averaged with Σ(w²/A)·πa² = 1, with w the weights, a the disc's radius and A the
     /// areas of the vertices, by Newton's method between a/20 and a; ρ = a or a/20 if there is no such radius between.
-    /// Where the tissue is thinner than the disc, ρ shrinks until the disc is simple. Gradients are in the frame of
-    /// `place`.
+    /// ρ = a for a disc made by [`SurfaceDisc::whole`]. Where the tissue is thinner than the disc, ρ shrinks until the disc
+    /// is simple. Gradients are in the frame of `place`.
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
         // Around a thin part, paths have no end: a large disc is tried in stages, from a small one upwards.
         let mut stages = 0;
@@ -550,7 +559,7 @@ impl SurfaceDisc {
         let mut rho_m = high;
         let (mut excess, mut slope) = self.weigh(rho_m, target_m2);
         let mut is_matched = false;
-        if excess < 0.0 {
+        if excess < 0.0 && !self.is_whole {
             rho_m = low;
             (excess, slope) = self.weigh(rho_m, target_m2);
             is_matched = excess > 0.0;

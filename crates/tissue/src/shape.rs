@@ -161,6 +161,23 @@ pub struct BoundPlace {
     pub height_m: f64,
 }
 
+/// A place within a cell of eight points. It moves with them, weighted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellPlace {
+    /// The numbers of the points at the corners of the cell.
+    pub points: [u32; 8],
+    /// Trilinear weight of each; at least 0, with the sum 1.
+    pub weights: [f64; 8],
+}
+
+impl CellPlace {
+    /// Returns the point with the largest weight.
+    pub fn most_moving(&self) -> PointId {
+        let most = (0..8).max_by(|a, b| self.weights[*a].total_cmp(&self.weights[*b])).unwrap_or(0);
+        PointId::new(self.points[most] as usize)
+    }
+}
+
 /// The surface by which frames show a tissue whose points are no grid ([`RestShape::shown_surface`]). Vertices are numbered
 /// as people and files number them.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -172,8 +189,10 @@ pub struct ShownShape<'s> {
     /// Named groups of vertices; empty if there are none.
     pub groups: &'s [Group],
     /// How each vertex moves with a triangle of the simulated points ([`RestShape::triangles`]). Empty if the vertices are
-    /// the points themselves, in their order.
+    /// the points themselves, in their order, or move with cells.
     pub bound: &'s [BoundPlace],
+    /// How each vertex moves with a cell of eight points; empty for a tissue without cells.
+    pub in_cells: &'s [CellPlace],
 }
 
 /// The rest shape of a tissue: its points, in the tissue's frame (the axes of the scene or mesh file, m).
@@ -221,6 +240,12 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     /// on a sheet, the middle. Haptic devices have their origin there, so that a tip that comes down meets the
     /// tissue.
     fn top_m(&self) -> DVec3 {
+        self.extent().middle_m()
+    }
+
+    /// Returns a place that stands for the tissue when nobody has chosen one, m: the disc of a first force law presses at
+    /// the place of the rest surface nearest to it. By default it is the middle of the box.
+    fn pressed_m(&self) -> DVec3 {
         self.extent().middle_m()
     }
 

@@ -8,7 +8,7 @@ use palpate_geometry::Group;
 
 use palpate_tissue::Model;
 use palpate_tissue::memory;
-use palpate_tissue::shape::{BoundPlace, PointId, RestShape, ShownShape};
+use palpate_tissue::shape::{BoundPlace, CellPlace, PointId, RestShape, ShownShape};
 
 /// Name of the skin's tables in messages.
 const TABLES: &str = "the shown surface of a mesh";
@@ -25,6 +25,8 @@ pub struct Skin {
     uv: Option<Vec<[f32; 2]>>,
     /// If the vertices are not the points: how each place of a frame moves with these. Otherwise empty.
     bound: Vec<SkinVertex>,
+    /// If the vertices move with cells of points: how each place of a frame does. Otherwise empty.
+    in_cells: Vec<CellPlace>,
     /// Rest positions of the points then, in the order of memory, m.
     rest_m: Vec<DVec3>,
 }
@@ -46,9 +48,20 @@ impl Skin {
         let shape = model.scene.shared_shape();
         let shown = shape.shown_surface()?;
         let uv = shape.shown_uv();
+        if !shown.in_cells.is_empty() {
+            return Some(Arc::new(Self::in_cells(shown.in_cells, place_of, uv, shape.clone())));
+        }
         if shown.bound.is_empty() {
             let (vertices, places) = (order.to_vec(), place_of.to_vec());
-            return Some(Arc::new(Skin { vertices, places, uv, bound: Vec::new(), rest_m: Vec::new(), shape }));
+            return Some(Arc::new(Skin {
+                vertices,
+                places,
+                uv,
+                bound: Vec::new(),
+                in_cells: Vec::new(),
+                rest_m: Vec::new(),
+                shape,
+            }));
         }
         let triangles = shape.triangles();
         let corners = |place: &BoundPlace| triangles[place.triangle as usize].map(|point| place_of[point as usize]);
@@ -68,7 +81,25 @@ impl Skin {
         let bound = memory::collected(bound, TABLES);
         let rest_m = order.iter().map(|point| shape.rest_m(PointId::new(*point as usize)));
         let rest_m = memory::collected(rest_m, TABLES);
-        Some(Arc::new(Skin { vertices, places, uv, bound, rest_m, shape }))
+        Some(Arc::new(Skin { vertices, places, uv, bound, in_cells: Vec::new(), rest_m, shape }))
+    }
+
+    /// Creates the skin of a tissue whose surface moves with cells of points.
+    fn in_cells(cells: &[CellPlace], place_of: &[u32], uv: Option<Vec<[f32; 2]>>, shape: Arc<dyn RestShape>) -> Self {
+        // Vertices that move with neighbouring cells are shown side by side.
+        #[allow(clippy::cast_possible_truncation)]
+        let mut vertices: Vec<u32> = memory::collected(0..cells.len() as u32, TABLES);
+        vertices.sort_by_key(|vertex| (cells[*vertex as usize].points[0], *vertex));
+        let mut places: Vec<u32> = memory::zeroed(cells.len(), TABLES);
+        for (place, vertex) in (0..).zip(&vertices) {
+            places[*vertex as usize] = place;
+        }
+        let in_memory = |vertex: &u32| {
+            let CellPlace { points, weights } = cells[*vertex as usize];
+            CellPlace { points: points.map(|point| place_of[point as usize]), weights }
+        };
+        let in_cells = memory::collected(vertices.iter().map(in_memory), TABLES);
+        Skin { vertices, places, uv, bound: Vec::new(), in_cells, rest_m: Vec::new(), shape }
     }
 
     /// Returns the shown surface at rest.
@@ -117,12 +148,13 @@ impl Skin {
     pub fn bytes(&self) -> u64 {
         let uv = self.uv.as_deref().map_or(0, size_of_val);
         let tables = size_of_val(&*self.vertices) + size_of_val(&*self.places);
-        (tables + uv + size_of_val(&*self.bound) + size_of_val(&*self.rest_m)) as u64
+        let bound = size_of_val(&*self.bound) + size_of_val(&*self.in_cells);
+        (tables + uv + bound + size_of_val(&*self.rest_m)) as u64
     }
 
     /// Returns whether the shown vertices differ from the simulated ones.
     pub(super) fn is_bound(&self) -> bool {
-        !self.bound.is_empty()
+        !self.bound.is_empty() || !self.in_cells.is_empty()
     }
 
     /// Returns the displacements of the shown vertices, m, in the order of a frame of `count` places, from those of
@@ -130,6 +162,12 @@ impl Skin {
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], count: usize) -> [Vec<f32>; 3] {
         let mut shown_m = [(); 3].map(|()| memory::zeroed::<f32>(count, TABLES));
+        for (place, CellPlace { points, weights }) in self.in_cells.iter().enumerate() {
+            for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
+                let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
+                shown_m[place] = points.iter().zip(weights).map(part_m).sum::<f64>() as f32;
+            }
+        }
         for (place, bound) in self.bound.iter().enumerate() {
             let moved_m = bound
                 .corners
@@ -154,6 +192,7 @@ impl PartialEq for Skin {
             || self.surface() == other.surface()
                 && self.vertices == other.vertices
                 && self.bound == other.bound
+                && self.in_cells == other.in_cells
                 && self.uv == other.uv
     }
 }

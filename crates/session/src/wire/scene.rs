@@ -12,8 +12,9 @@ use super::required;
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
 use palpate_tissue::scene::sent::{self, MeshFile};
 use palpate_tissue::scene::{
-    Appearance, Body, Change, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named,
-    PointSet, Precision, Region, Scene, Sheet, Simulated, Springs, Stepping, Substance, Volume,
+    Appearance, Body, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Material,
+    Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid, SolidMaterial, Springs, Stepping,
+    Substance, Volume,
 };
 use palpate_tissue::shape::RestShape;
 
@@ -27,13 +28,24 @@ use palpate_tissue::shape::RestShape;
 /// - An integrator, precision or group is unknown; the mesh can't be simulated with that number of vertices; a ball,
 ///   an inclusion, a factor of bending or a volume is invalid or does not fit the mesh.
 pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Scene> {
-    let substance = match &message.mesh {
-        None => from_sheet(message)?,
-        Some(_) if message.sheet.is_some() => {
-            let message = "does not go with `sheet`: a tissue is one of them";
-            return Err(Refusal::new(Reason::WrongKind, "mesh", message));
+    let alone = |field: &str| match message.sheet {
+        Some(_) => Err(Refusal::new(Reason::WrongKind, field, "does not go with `sheet`: a tissue is one of them")),
+        None => Ok(()),
+    };
+    let substance = match (&message.mesh, &message.solid) {
+        (None, None) => from_sheet(message)?,
+        (Some(of_mesh), None) => {
+            alone("mesh")?;
+            from_mesh(message, of_mesh, required("mesh.mesh_id", mesh)?)?
         }
-        Some(of_mesh) => from_mesh(message, of_mesh, required("mesh.mesh_id", mesh)?)?,
+        (None, Some(of_solid)) => {
+            alone("solid")?;
+            from_solid(message, of_solid, required("solid.mesh_id", mesh)?)?
+        }
+        (Some(_), Some(_)) => {
+            let message = "does not go with `mesh`: a tissue is one of them";
+            return Err(Refusal::new(Reason::WrongKind, "solid", message));
+        }
     };
     Ok(Scene {
         name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
@@ -145,6 +157,54 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
     }
 }
 
+fn from_solid(message: &pb::Scene, of_solid: &pb::Solid, mesh: &TriangleMesh) -> Result<Substance> {
+    for (field, is_there, why) in [
+        ("material", message.material.is_some(), SolidMaterial::FOLLOWS),
+        ("springs", message.springs.is_some(), SolidMaterial::FOLLOWS),
+        ("anchor_springs", message.anchor_springs.is_some(), SolidMaterial::FOLLOWS),
+        ("damping", message.damping.is_some(), SolidMaterial::FOLLOWS),
+        ("volume", message.volume.is_some(), Volume::OF_A_MESH),
+    ] {
+        if is_there {
+            return Err(Refusal::new(Reason::WrongKind, field, why));
+        }
+    }
+    let usual = SolidMaterial::usual();
+    let material = SolidMaterial {
+        youngs_modulus_pa: required("solid.youngs_modulus_pa", of_solid.youngs_modulus_pa)?,
+        poissons_ratio: required("solid.poissons_ratio", of_solid.poissons_ratio)?,
+        density_kg_per_m3: of_solid.density_kg_per_m3.unwrap_or(usual.density_kg_per_m3),
+        damping_per_s: of_solid.damping_per_s.unwrap_or(usual.damping_per_s),
+    };
+    let size = match (of_solid.cell_m, of_solid.cells) {
+        (Some(cell_m), _) => CellSize::Edge(positive("solid.cell_m", cell_m)?),
+        (None, Some(cells)) => CellSize::Count(f64::from(cells)),
+        (None, None) => CellSize::USUAL,
+    };
+    let fixed = of_solid.fixed.iter().enumerate().map(from_fixed_part).collect::<Result<Vec<_>>>()?;
+    if fixed.is_empty() {
+        return Err(Refusal::new(Reason::Missing, "solid.fixed", "is missing: nothing would hold the solid"));
+    }
+    let solid = Solid::of(mesh.clone(), size, &fixed, material)?;
+    let inclusions = message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?;
+    Substance::of_solid(solid).with(inclusions, "inclusions")
+}
+
+fn from_fixed_part((index, message): (usize, &pb::FixedPart)) -> Result<FixedPart> {
+    let field = |key: &str| format!("solid.fixed[{index}].{key}");
+    let place = |key: &str, place: &Option<pb::Vector3>| -> Result<DVec3> {
+        Ok(from_vector(Some(required(&field(key), place.as_ref())?)))
+    };
+    let part = match required(&field("part"), message.part.as_ref())? {
+        pb::fixed_part::Part::Plane(plane) => {
+            FixedPart::plane(place("plane_m", &plane.plane_m)?, place("normal", &plane.normal)?, plane.within_m)
+        }
+        pb::fixed_part::Part::Ball(ball) => FixedPart::ball(place("centre_m", &ball.centre_m)?, ball.radius_m),
+        pb::fixed_part::Part::Group(name) => Ok(FixedPart::Group(name.clone())),
+    };
+    part.map_err(|refusal| refusal.within(&format!("solid.fixed[{index}]")))
+}
+
 fn from_material(message: &pb::Material) -> Result<Material> {
     let usual = Material::new(
         required("material.youngs_modulus_pa", message.youngs_modulus_pa)?,
@@ -247,6 +307,9 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
 /// vertices and ID.
 pub fn sent(scene: &Scene) -> pb::Scene {
     let mut message = self::scene(scene);
+    if message.solid.is_some() {
+        (message.springs, message.anchor_springs, message.damping) = (None, None, None);
+    }
     if message.material.is_some() {
         message.anchor_springs = None;
         message.damping = None;
@@ -286,11 +349,9 @@ impl SceneToSend {
         if let (Some(said), Some(of_scene)) = (said, &mut message.mesh) {
             of_scene.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
         }
-        let upload = scene.mesh().map(|mesh| {
-            file.unwrap_or_else(|| {
-                let (name, bytes, unit) = sent::file(mesh);
-                MeshToSend { name: name.to_owned(), bytes, unit: unit.to_owned() }
-            })
+        let upload = file.or_else(|| {
+            let (name, bytes, unit) = sent::file_of(scene)?;
+            Some(MeshToSend { name: name.to_owned(), bytes, unit: unit.to_owned() })
         });
         SceneToSend { message, upload }
     }
@@ -311,6 +372,9 @@ impl SceneToSend {
 pub fn from_told(message: &pb::Scene, mesh: &TriangleMesh) -> Result<Scene> {
     // The coefficients that follow from a material are sent as well.
     let mut even = pb::Scene { material: None, inclusions: Vec::new(), ..message.clone() };
+    if even.solid.is_some() {
+        (even.springs, even.anchor_springs, even.damping) = (None, None, None);
+    }
     // Scripts name the vertices of the file. Only the server knows which point of a coarser mesh each one belongs to.
     even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
     from_scene(&even, Some(mesh))
@@ -324,6 +388,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         name: scene.name.clone(),
         sheet: scene.sheet().map(sheet),
         mesh: of_mesh.map(mesh),
+        solid: if let Body::Solid(solid) = &scene.body { Some(self::solid(solid)) } else { None },
         material: scene.material.as_ref().map(material),
         inclusions: scene.inclusions.iter().map(inclusion).collect(),
         springs: Some(pb::Springs {
@@ -345,6 +410,31 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             correct: scene.stepping.correct,
         }),
         sleep: scene.sleep_tolerance.map(|tolerance| pb::Sleep { tolerance: Some(tolerance) }),
+    }
+}
+
+/// Returns a solid as a message, without its surface.
+fn solid(solid: &Solid) -> pb::Solid {
+    let part = |part: &FixedPart| match part {
+        FixedPart::Plane { plane_m, normal, within_m } => pb::fixed_part::Part::Plane(pb::FixedPlane {
+            plane_m: vector(*plane_m),
+            normal: vector(*normal),
+            within_m: *within_m,
+        }),
+        FixedPart::Ball { centre_m, radius_m } => {
+            pb::fixed_part::Part::Ball(pb::Ball { centre_m: vector(*centre_m), radius_m: *radius_m })
+        }
+        FixedPart::Group(name) => pb::fixed_part::Part::Group(name.clone()),
+    };
+    pb::Solid {
+        mesh_id: String::new(),
+        cell_m: Some(solid.shape.lattice().edge_m),
+        cells: None,
+        fixed: solid.shape.fixed().iter().map(|fixed| pb::FixedPart { part: Some(part(fixed)) }).collect(),
+        youngs_modulus_pa: Some(solid.material.youngs_modulus_pa),
+        poissons_ratio: Some(solid.material.poissons_ratio),
+        density_kg_per_m3: Some(solid.material.density_kg_per_m3),
+        damping_per_s: Some(solid.material.damping_per_s),
     }
 }
 

@@ -1,15 +1,18 @@
-//! The kinds of tissue, with one folder each: `sheet` and `surface` (meshes). Each has its layout, its sweep
-//! over the springs, and the contact of a disc with it.
+//! The kinds of tissue, with one folder each: `sheet`, `surface` (meshes) and `solid`. Each has its layout, its sweep, and
+//! the contact of a disc with it.
 
 mod advance;
+pub(crate) mod bonds;
 pub(crate) mod disc;
 pub(crate) mod footprint;
 pub(crate) mod force_field;
 pub mod model;
 pub(crate) mod sheet;
+pub(crate) mod solid;
 pub mod surface;
 pub(crate) mod tables;
 pub(crate) mod tile_graph;
+pub(crate) mod tile_links;
 pub mod window;
 
 use std::ops::Range;
@@ -20,21 +23,27 @@ use glam::DVec3;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::Width;
 use crate::kernel::real::Real;
+use crate::kernel::region::sides_of;
 use crate::scene::graph::GraphFault;
 use crate::scene::profile::Poke;
 use crate::scene::{Body, Scene, Sheet};
 use crate::shape::{self, PointId};
 use disc::TissueDisc;
+use force_field::ForceChange;
 use sheet::falloff::SheetPoints;
 use sheet::footprint::GridDisc;
+use solid::SolidPlaces;
+use solid::footprint::SolidDisc;
 use surface::footprint::MeshDisc;
 use surface::{MeshPlaces, VolumePlaces};
+use tile_links::TileLinks;
 
 /// Returns a disc of `radius_m` (m) on a tissue, at an arbitrary place: the list of the kinds' discs.
 pub(crate) fn disc_on(body: &Body, radius_m: f64) -> Box<dyn TissueDisc> {
     match body {
         Body::Sheet(sheet) => Box::new(GridDisc::new(sheet, radius_m)),
         Body::Mesh(mesh) => Box::new(MeshDisc::new(&mesh.shape, radius_m)),
+        Body::Solid(solid) => Box::new(SolidDisc::new(&solid.shape, radius_m)),
     }
 }
 
@@ -54,6 +63,8 @@ pub(crate) enum Places {
     Sheet(SheetPoints),
     /// Points in any arrangement, as of a mesh, and their springs.
     Surface(Arc<MeshPlaces>),
+    /// The corners of the cubes of a solid.
+    Solid(Arc<SolidPlaces>),
 }
 
 impl MemoryLayout {
@@ -66,6 +77,14 @@ impl MemoryLayout {
             let Sheet { points, spacing_m, .. } = *sheet;
             let places = Places::Sheet(SheetPoints { points, spacing_m });
             return Ok(MemoryLayout { points, fixed: sheet.fixed_indices(), places });
+        }
+        if let Body::Solid(solid) = &scene.body {
+            let places = SolidPlaces::of(solid);
+            return Ok(MemoryLayout {
+                points: places.size(),
+                fixed: places.fixed(),
+                places: Places::Solid(Arc::new(places)),
+            });
         }
         let (kind, shape) = (scene.body.kind(), scene.shape());
         let places = MeshPlaces::of(kind, &kind.graph())?;
@@ -80,24 +99,59 @@ impl Places {
     /// Returns what a mesh has, if the tissue is one.
     fn surface(&self) -> Option<&MeshPlaces> {
         match self {
-            Places::Sheet(_) => None,
             Places::Surface(places) => Some(places),
+            Places::Sheet(_) | Places::Solid(_) => None,
+        }
+    }
+
+    /// Returns what a solid has, if the tissue is one.
+    fn solid(&self) -> Option<&SolidPlaces> {
+        if let Places::Solid(places) = self { Some(places) } else { None }
+    }
+
+    /// Returns which tiles are joined, but for a sheet, whose tiles are joined to those around them.
+    pub(crate) fn links(&self) -> Option<&TileLinks> {
+        match self {
+            Places::Sheet(_) => None,
+            Places::Surface(places) => Some(&places.links),
+            Places::Solid(places) => Some(&places.links),
+        }
+    }
+
+    /// Returns an upper bound of the change of force on any point of a tile, N; on a mesh divided by the smallest relative
+    /// K″ of the tile.
+    fn most_change_n(&self, change: &ForceChange, layout: &Layout, tile: usize) -> f64 {
+        match self {
+            Places::Sheet(_) => f64::INFINITY,
+            Places::Surface(places) => change.most_n(places.box_of(tile)) / places.least_pull(tile),
+            Places::Solid(places) => change.most_n(&places.box_of(&sides_of(layout, tile))),
         }
     }
 
     /// Returns the place of a point.
     pub(crate) fn place_of(&self, point: PointId) -> usize {
-        self.surface().map_or(point.index(), |places| places.slot_of(point))
+        match self {
+            Places::Sheet(_) => point.index(),
+            Places::Surface(places) => places.slot_of(point),
+            Places::Solid(places) => places.place_of(point),
+        }
     }
 
     /// Returns the point at a place; for an empty place, any point.
     pub(crate) fn point_at(&self, place: usize) -> PointId {
-        self.surface().map_or(PointId::new(place), |places| places.point_in(place))
+        match self {
+            Places::Sheet(_) => PointId::new(place),
+            Places::Surface(places) => places.point_in(place),
+            Places::Solid(places) => places.point_at(place),
+        }
     }
 
     /// Returns the point at each place and the place of each of `points` points; `None` if their order is that of the
     /// points.
     pub(crate) fn order(&self, points: usize) -> Option<[&[u32]; 2]> {
+        if let Places::Solid(places) = self {
+            return Some(places.order());
+        }
         let slots = &self.surface()?.slots;
         // Empty places are at the end.
         Some([&slots.vertex_of()[..points], slots.slot_of()])
@@ -105,17 +159,25 @@ impl Places {
 
     /// Returns whether points may differ in mass and anchor stiffness.
     pub(crate) fn differ(&self) -> bool {
-        self.surface().is_some()
+        !matches!(self, Places::Sheet(_))
     }
 
     /// Returns the mass at a place divided by the reference mass.
     pub(crate) fn relative_mass(&self, place: usize) -> f64 {
-        self.surface().map_or(1.0, |places| places.slots.mass(place))
+        match self {
+            Places::Sheet(_) => 1.0,
+            Places::Surface(places) => places.slots.mass(place),
+            Places::Solid(places) => places.mass(place),
+        }
     }
 
     /// Returns the largest relative mass.
     pub(crate) fn largest_mass(&self) -> f64 {
-        self.surface().map_or(1.0, |places| places.largest_mass)
+        match self {
+            Places::Sheet(_) => 1.0,
+            Places::Surface(places) => places.largest_mass,
+            Places::Solid(places) => places.largest_mass,
+        }
     }
 
     /// Returns K″/m at a place divided by the reference value, minus 1.
@@ -149,6 +211,7 @@ impl Places {
                 let rows = places.rows_within(poke.centre_m, reach_m);
                 [[rows.start, rows.end], [0, if rows.is_empty() { 0 } else { BLOCK }]]
             }
+            Places::Solid(places) => places.reached(poke.centre_m, reach_m),
         }
     }
 
@@ -166,6 +229,7 @@ impl Places {
         match self {
             Places::Sheet(points) => points.fall_off(width, poke, layout, [rows, columns], factors, spans),
             Places::Surface(places) => places.fall_off(poke, layout, rows, factors, spans),
+            Places::Solid(places) => places.fall_off(poke, layout, [rows, columns], factors, spans),
         }
     }
 
@@ -174,6 +238,7 @@ impl Places {
         match self {
             Places::Sheet(points) => points.away_m(place, centre_m),
             Places::Surface(places) => places.rest_m(place).distance(centre_m),
+            Places::Solid(places) => places.rest_m(place).distance(centre_m),
         }
     }
 

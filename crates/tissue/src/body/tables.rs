@@ -10,6 +10,7 @@ use crate::body::force_field::{self, Pull, Term};
 use crate::body::model::{Model, Plan};
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
+use crate::body::solid::{self, CellLaw, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
@@ -30,6 +31,8 @@ pub(crate) enum Elastic<T> {
     /// A mesh: its places; a spring of length 1 with the reference k, of which those of the mesh are multiples;
     /// the factor of the extra anchor stiffness; and the factor of the growth of a volume.
     Mesh(Arc<MeshPlaces>, SpringCoefficients<T>, T, f64),
+    /// A solid: its places, and the law of its cubes.
+    Solid(Arc<SolidPlaces>, CellLaw<T>),
 }
 
 impl<T: Real> Elastic<T> {
@@ -44,6 +47,7 @@ impl<T: Real> Elastic<T> {
     pub(crate) fn gather_inline(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
+            Elastic::Solid(places, law) => solid::gather(places, law, layout, u, point[0] * layout.columns + point[1]),
             Elastic::Mesh(places, unit, pull, factor) => {
                 let slot = point[0] * BLOCK + point[1];
                 let pressed = places.volume.as_ref().map(|volume| {
@@ -78,6 +82,10 @@ pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
     let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
     match &model.places {
         Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
+        Places::Solid(places) => {
+            let (stiffness, [shear, lame]) = (unit * model.scene.springs.stiffness_n_per_m, places.lame_over_youngs());
+            Elastic::Solid(places.clone(), CellLaw::new(stiffness, shear, lame))
+        }
         Places::Surface(places) => Elastic::Mesh(
             places.clone(),
             SpringCoefficients::new(unit * model.scene.springs.stiffness_n_per_m, 1.0),
@@ -100,8 +108,10 @@ pub(crate) struct SweepTables<T> {
     width: Width,
     pub(crate) layout: Layout,
     pub(crate) springs: Elastic<T>,
-    /// `None` for a sheet.
+    /// `None` but for a mesh.
     mesh: Option<MeshTables<T>>,
+    /// `None` but for a solid.
+    solid: Option<SolidTables<T>>,
     /// `None` without a volume.
     pub(crate) pressure: Option<Pressure<T>>,
     /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
@@ -121,7 +131,8 @@ impl<T: Real> SweepTables<T> {
             free
         });
         let zero = [T::default(); BLOCK];
-        let carry = if model.places.surface().is_some() { Field::of_length(0) } else { Field::zero(&layout) };
+        let is_sheet = matches!(model.places, Places::Sheet(_));
+        let carry = if is_sheet { Field::zero(&layout) } else { Field::of_length(0) };
         SweepTables {
             width: Width::of(model.lanes),
             layout,
@@ -130,6 +141,7 @@ impl<T: Real> SweepTables<T> {
                 springs: MeshSprings::new(&graph.slots, lanes::shape::<T>(Width::of(model.lanes))),
                 snapshot: RefCell::new(Snapshot::of(&graph.slots)),
             }),
+            solid: model.places.solid().map(|places| SolidTables::new(places, &layout)),
             pressure: model.places.surface().and_then(|graph| Pressure::new(graph, &layout)),
             free,
             carry: RefCell::new(carry),
@@ -145,6 +157,7 @@ impl<T: Real> SweepTables<T> {
             layout: self.layout,
             springs: self.springs.clone(),
             mesh: None,
+            solid: None,
             pressure: None,
             free: None,
             carry: RefCell::new(Field::of_length(0)),
@@ -156,6 +169,9 @@ impl<T: Real> SweepTables<T> {
     /// Returns the relative mass of each place, and its extra K″/m; null if all masses are 1, or all extra
     /// values 0.
     pub(crate) fn masses_and_extra(&self) -> [*const T; 2] {
+        if let Some(solid) = &self.solid {
+            return [solid.masses.as_ptr(), std::ptr::null()];
+        }
         self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
     }
 
@@ -255,6 +271,12 @@ impl<T: Real> SweepTables<T> {
                 let grid = Grid { layout, springs, x, carry: carry.as_mut_ptr() };
                 // SAFETY: the caller's promise.
                 unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
+            }
+            (Elastic::Solid(places, law), _) => {
+                let Some(tables) = &self.solid else { return };
+                let grid = SolidGrid { layout, places, tables, law, x };
+                // SAFETY: the caller's promise; the tables were made for these places.
+                unsafe { lanes::run(self.width, &SolidSweep { grid, over, stage }) };
             }
             // A copy for reading has no tables, and is not swept.
             (Elastic::Mesh(..), None) => {}

@@ -2,11 +2,10 @@
 
 use std::ops::Range;
 use std::option;
-use std::sync::Arc;
 
 use super::Places;
 use super::sheet::tiles::{EdgeWatch, SheetTiles};
-use super::surface::MeshPlaces;
+use super::tile_links::TileLinks;
 use crate::body::force_field::ForceChange;
 use crate::body::model::Model;
 use crate::kernel::field::{Field, Layout};
@@ -18,8 +17,8 @@ use crate::kernel::region::{Marks, tile_of};
 pub(crate) enum TileGraph {
     /// The tiles of a sheet.
     Sheet(SheetTiles),
-    /// The tiles of a mesh, and its layout in memory.
-    Surface(Arc<MeshPlaces>, Layout),
+    /// The tiles of a tissue whose places are joined in any way, its places, and its layout in memory.
+    Linked(Places, Layout),
 }
 
 /// The comparisons of sleeping tiles next to awake ones.
@@ -43,44 +42,44 @@ impl TileGraph {
     pub(crate) fn of(layout: Layout, model: &Model) -> Self {
         match &model.places {
             Places::Sheet(_) => TileGraph::Sheet(SheetTiles::new(layout, model.spring_rows())),
-            Places::Surface(places) => TileGraph::Surface(places.clone(), layout),
+            places => TileGraph::Linked(places.clone(), layout),
         }
     }
 
     /// Returns the tiles that springs join to a tile.
     pub(crate) fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        let (sheet, surface) = self.parts();
-        surface.flat_map(move |places| places.beside(tile)).chain(sheet.flat_map(move |sheet| sheet.beside(tile)))
+        let (sheet, links) = self.parts();
+        links.flat_map(move |links| links.beside(tile)).chain(sheet.flat_map(move |sheet| sheet.beside(tile)))
     }
 
     /// Returns the tiles in which springs begin that reach a tile: on a mesh, all that are joined to it.
     pub(crate) fn pulling(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        let (sheet, surface) = self.parts();
-        surface.flat_map(move |places| places.beside(tile)).chain(sheet.flat_map(move |sheet| sheet.pulling(tile)))
+        let (sheet, links) = self.parts();
+        links.flat_map(move |links| links.beside(tile)).chain(sheet.flat_map(move |sheet| sheet.pulling(tile)))
     }
 
     /// Returns the tile of a point and those that its springs reach in `sweeps` sweeps; some perhaps twice.
     pub(crate) fn reached(&self, point: [usize; 2], sweeps: usize) -> impl Iterator<Item = usize> + '_ {
-        let (sheet, surface) = self.parts();
-        let of_surface = surface.flat_map(move |places| {
+        let (sheet, links) = self.parts();
+        let linked = links.flat_map(move |links| {
             let tile = tile_of(self.layout(), point);
-            places.beside(tile).chain([tile])
+            links.beside(tile).chain([tile])
         });
-        of_surface.chain(sheet.flat_map(move |sheet| sheet.reached(point, sweeps)))
+        linked.chain(sheet.flat_map(move |sheet| sheet.reached(point, sweeps)))
     }
 
     fn layout(&self) -> &Layout {
         match self {
             TileGraph::Sheet(sheet) => &sheet.layout,
-            TileGraph::Surface(_, layout) => layout,
+            TileGraph::Linked(_, layout) => layout,
         }
     }
 
     /// Returns the one that there is, as iterators of at most one.
-    fn parts(&self) -> (option::IntoIter<&SheetTiles>, option::IntoIter<&MeshPlaces>) {
+    fn parts(&self) -> (option::IntoIter<&SheetTiles>, option::IntoIter<&TileLinks>) {
         match self {
             TileGraph::Sheet(sheet) => (Some(sheet).into_iter(), None.into_iter()),
-            TileGraph::Surface(places, _) => (None.into_iter(), Some(&**places).into_iter()),
+            TileGraph::Linked(places, _) => (None.into_iter(), places.links().into_iter()),
         }
     }
 
@@ -88,7 +87,7 @@ impl TileGraph {
     pub(crate) fn remembered_values(&self, tiles: usize) -> usize {
         match self {
             TileGraph::Sheet(_) => SheetTiles::remembered(tiles).start,
-            TileGraph::Surface(places, _) => 3 * places.watched_slots(),
+            TileGraph::Linked(places, _) => 3 * places.links().map_or(0, TileLinks::watched),
         }
     }
 
@@ -96,10 +95,10 @@ impl TileGraph {
     pub(crate) fn remembered(&self, tile: usize) -> Range<usize> {
         match self {
             TileGraph::Sheet(_) => SheetTiles::remembered(tile),
-            TileGraph::Surface(places, _) => {
-                let (slots, first) = places.around(tile);
-                3 * first..3 * (first + slots.len())
-            }
+            TileGraph::Linked(places, _) => places.links().map_or(0..0, |links| {
+                let (around, first) = links.around(tile);
+                3 * first..3 * (first + around.len())
+            }),
         }
     }
 
@@ -107,7 +106,9 @@ impl TileGraph {
     pub(crate) fn remember<T: Real>(&self, tile: usize, u: &Field<T>, snapshots: &mut [T]) {
         match self {
             TileGraph::Sheet(sheet) => sheet.remember(tile, u, snapshots),
-            TileGraph::Surface(places, layout) => places.remember(layout, tile, u, snapshots),
+            TileGraph::Linked(places, layout) => {
+                places.links().into_iter().for_each(|links| links.remember(layout, tile, u, snapshots));
+            }
         }
     }
 
@@ -118,8 +119,8 @@ impl TileGraph {
         tiles.clear();
         match self {
             TileGraph::Sheet(sheet) => awake.members.iter().for_each(|tile| sheet.watch(*tile, awake, edges)),
-            TileGraph::Surface(places, _) => {
-                let beside = awake.members.iter().flat_map(|tile| places.beside(*tile));
+            TileGraph::Linked(..) => {
+                let beside = awake.members.iter().flat_map(|tile| self.beside(*tile));
                 tiles.extend(beside.filter(|other| !awake.has[*other]));
                 tiles.sort_unstable();
                 tiles.dedup();
@@ -143,8 +144,10 @@ impl TileGraph {
                 let moved = |watch: &&EdgeWatch| sheet.has_moved(watch, [u, d], snapshots, sweeps, far);
                 watches.edges.iter().filter(moved).map(|watch| watch.tile).collect()
             }
-            TileGraph::Surface(places, layout) => {
-                let moved = |tile: &&usize| places.has_moved(layout, **tile, u, snapshots, far);
+            TileGraph::Linked(places, layout) => {
+                let moved = |tile: &&usize| {
+                    places.links().is_some_and(|links| links.has_moved(layout, **tile, u, snapshots, far))
+                };
                 watches.tiles.iter().filter(moved).copied().collect()
             }
         }
@@ -162,9 +165,9 @@ impl TileGraph {
     ) {
         match self {
             TileGraph::Sheet(sheet) => sheet.force_changes(change, spacing_m, everywhere, awake, changed),
-            TileGraph::Surface(places, _) => {
+            TileGraph::Linked(places, layout) => {
                 for tile in (0..awake.len()).filter(|tile| !awake[*tile]) {
-                    changed(tile, change.most_n(places.box_of(tile)) / places.least_pull(tile));
+                    changed(tile, places.most_change_n(change, layout, tile));
                 }
             }
         }

@@ -3,8 +3,10 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::body::Places;
+use crate::body::bonds::Bonds;
 use crate::body::footprint::Footprint;
 use crate::body::model::Model;
+use crate::body::solid::linear::LinearCells;
 use crate::scheme::Relaxation;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
@@ -58,7 +60,7 @@ impl Window {
     pub(crate) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
         match &model.places {
             Places::Sheet(_) => Self::of_sheet(model, radius_m, centre_m.truncate()),
-            Places::Surface(_) => {
+            Places::Surface(_) | Places::Solid(_) => {
                 let shape = model.shape();
                 let mut within_m = half_window_m(model, radius_m).min(2.0 * shape.longest_side_m());
                 let mut points = shape.around(centre_m, within_m);
@@ -91,7 +93,7 @@ impl Window {
     pub(crate) fn all(model: &Model) -> Self {
         match &model.places {
             Places::Sheet(_) => Window::Grid { origin: [0; 2], size: model.points },
-            Places::Surface(_) => Window::Ball((0..model.len()).collect()),
+            Places::Surface(_) | Places::Solid(_) => Window::Ball((0..model.len()).collect()),
         }
     }
 
@@ -165,15 +167,18 @@ impl Window {
         }
     }
 
-    /// Returns the springs that join points of the window, at least one of which is `free`. Rest vectors are
-    /// turned by `turn`.
-    pub(crate) fn springs(&self, model: &Model, free: &[bool], turn: &DMat3) -> Vec<Spring> {
+    /// Returns what joins points of the window, at least one of which is `free`. Rest vectors are turned by `turn`.
+    pub(crate) fn bonds(&self, model: &Model, free: &[bool], turn: &DMat3) -> Bonds {
+        if let (Places::Solid(places), Window::Ball(part)) = (&model.places, self) {
+            let stiffness_n_per_m = model.scene.springs.stiffness_n_per_m;
+            return Bonds::Cells(LinearCells::of(places, part, stiffness_n_per_m, model.unit_m, turn));
+        }
         let mut springs = match self {
             Window::Ball(slots) => of_mesh(model, slots, free),
             Window::Grid { size, .. } => of_grid(model, *size, free),
         };
         springs.iter_mut().for_each(|spring| spring.rest_m = *turn * spring.rest_m);
-        springs
+        Bonds::Springs(springs)
     }
 
     /// Returns Σ m·|∂u/∂x|² over the points, the mean of both directions of the surface, with the relative `masses` of

@@ -20,9 +20,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::body::MemoryLayout;
+use crate::body::bonds::Bonds;
 use crate::body::footprint::{Footprint, WeightedNode};
 use crate::body::model::Model;
-use crate::body::window::{Spring, Window};
+use crate::body::window::Window;
 use crate::memory;
 
 /// The accuracy of a solution: the bounds at which the solvers stop.
@@ -95,7 +96,7 @@ pub struct LinearPatch<'m> {
     /// Mass and K″ of each point divided by the reference values.
     masses: Vec<f64>,
     stiffness: Vec<f64>,
-    springs: Vec<Spring>,
+    bonds: Bonds,
     pressure: Option<SharedPressure>,
     inverses: Vec<DMat3>,
     accuracy: Accuracy,
@@ -184,7 +185,7 @@ impl<'m> LinearPatch<'m> {
     /// Creates the patch of a window with given weights of the points. Directions are turned by `turn`.
     fn weighted(model: &'m Model, weights: Vec<f64>, window: Window, displacement_m: Vec<DVec3>, turn: &DMat3) -> Self {
         let free = window.free(model);
-        let springs = window.springs(model, &free, turn);
+        let bonds = window.bonds(model, &free, turn);
         let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();
         let stiffness = window.points(model).map(|index| model.relative_anchor_stiffness_at(index)).collect();
         let mut patch = LinearPatch {
@@ -196,7 +197,7 @@ impl<'m> LinearPatch<'m> {
             weights,
             masses,
             stiffness,
-            springs,
+            bonds,
             inverses: Vec::new(),
             accuracy: Accuracy::EXACT,
             allowance: Allowance::default(),
@@ -212,28 +213,12 @@ impl<'m> LinearPatch<'m> {
         Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
 
-    /// Computes the springs' tangents and forces at the present displacements.
+    /// Computes forces and tangents at the present displacements.
     fn linearise(&mut self) {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         self.inverses.clear();
         self.inverses.extend(self.stiffness.iter().map(|part| DMat3::from_diagonal(DVec3::splat(own * part))));
-        for spring in &mut self.springs {
-            let [a, b] = spring.ends;
-            let delta = self.displacement_m[b] - self.displacement_m[a];
-            let apart_m = spring.rest_m + delta;
-            let rest_squared = spring.rest_m.length_squared();
-            // 1 − L0/L without cancellation (`springs`).
-            let q = ((2.0 * spring.rest_m + delta).dot(delta) / rest_squared).max(1e-12 - 1.0);
-            let s = (1.0 + q).sqrt();
-            let stretch = q / (s * (1.0 + s));
-            let along = apart_m / (s * rest_squared.sqrt());
-            let outer = DMat3::from_cols(along * along.x, along * along.y, along * along.z);
-            let across = stretch.max(0.0);
-            spring.force_n = spring.stiffness_n_per_m * stretch * apart_m;
-            spring.tangent = spring.stiffness_n_per_m * (outer * (1.0 - across) + DMat3::IDENTITY * across);
-            self.inverses[a] += spring.tangent;
-            self.inverses[b] += spring.tangent;
-        }
+        self.bonds.linearise(&self.displacement_m, &mut self.inverses);
         if let Some(SharedPressure { areas_m2, pa_per_m3 }) = &self.pressure {
             for (block, area) in self.inverses.iter_mut().zip(areas_m2) {
                 *block += DMat3::from_cols(*area * area.x, *area * area.y, *area * area.z) * *pa_per_m3;
@@ -253,13 +238,7 @@ impl<'m> LinearPatch<'m> {
                 product[system] = own * part * x[system];
             }
         }
-        for Spring { ends: [a, b], tangent, .. } in &self.springs {
-            for system in 0..N {
-                let pull = *tangent * (x[*b][system] - x[*a][system]);
-                product[*a][system] -= pull;
-                product[*b][system] += pull;
-            }
-        }
+        self.bonds.times(x, product);
         if let Some(pressure) = &self.pressure {
             for system in 0..N {
                 let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(x.iter().map(|x| &x[system]));
@@ -300,7 +279,7 @@ impl<'m> LinearPatch<'m> {
             if (0..N).all(|system| left[system] <= good * good * whole[system]) {
                 return (x, iteration);
             }
-            if !self.allowance.take(self.springs.len()) {
+            if !self.allowance.take(self.bonds.work()) {
                 return (x, iteration);
             }
             self.times(&direction, &mut product);
@@ -345,7 +324,7 @@ impl<'m> LinearPatch<'m> {
             stiffness_n_per_m,
             damping_n_s_per_m: scene.damping_n_s_per_m * unit,
             drag_n_s_per_m: scene.damping_n_s_per_m
-                * self.window.slopes(self.model, &self.springs, &self.masses, &self.displacement_m),
+                * self.window.slopes(self.model, self.bonds.springs(), &self.masses, &self.displacement_m),
             mass_kg: scene.point_mass_kg() * unit.z_axis.z,
             iterations,
         }
@@ -363,10 +342,7 @@ impl<'m> LinearPatch<'m> {
                 .zip(&self.stiffness)
                 .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z])
                 .collect();
-            for spring in &self.springs {
-                right[spring.ends[0]][0] += spring.force_n;
-                right[spring.ends[1]][0] -= spring.force_n;
-            }
+            self.bonds.forces(|point, force_n| right[point][0] += force_n);
             if let Some(pressure) = &self.pressure {
                 let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(self.displacement_m.iter());
                 for (right, area) in right.iter_mut().zip(&pressure.areas_m2) {

@@ -334,18 +334,21 @@ impl Inclusion {
         Ok(())
     }
 
-    /// Returns how much each vertex belongs to the inclusion: 1 within, 0 beyond its edge, smooth between.
+    /// Returns how much a place belongs to the inclusion that is `beyond_m` (m) beyond its region: 1 within, 0 beyond its
+    /// edge, smooth between.
+    pub(super) fn part_beyond(&self, beyond_m: f64) -> f64 {
+        if beyond_m <= 0.0 {
+            return 1.0;
+        }
+        // With an edge of 0, this is infinite; an edge of −0 must not give minus infinity.
+        let x = beyond_m / unsigned_zero(self.edge_m);
+        if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
+    }
+
+    /// Returns how much each vertex belongs to the inclusion ([`Inclusion::part_beyond`]).
     fn parts(&self, shape: &MeshShape) -> Vec<f64> {
         let mut parts = self.region.beyond_m(shape, self.edge_m);
-        for part in &mut parts {
-            *part = if *part <= 0.0 {
-                1.0
-            } else {
-                // With an edge of 0, this is infinite; an edge of −0 must not give minus infinity.
-                let x = *part / unsigned_zero(self.edge_m);
-                if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
-            };
-        }
+        parts.iter_mut().for_each(|part| *part = self.part_beyond(*part));
         parts
     }
 

@@ -982,12 +982,14 @@ impl RestShape for MeshShape {
                 triangles: &self.triangles,
                 groups: &self.told.groups,
                 bound: &[],
+                in_cells: &[],
             },
             Some(Shown { mesh, places, .. }) => ShownShape {
                 vertices_m: &mesh.vertices_m,
                 triangles: &mesh.triangles,
                 groups: &mesh.groups,
                 bound: places,
+                in_cells: &[],
             },
         })
     }

@@ -19,6 +19,7 @@ pub mod script_reader;
 pub mod sent;
 mod sheet;
 mod shown;
+mod solid;
 mod source;
 mod springs;
 pub mod toml_document;
@@ -41,6 +42,7 @@ pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{Shown, Simulated};
+pub use solid::{CellSize, FixedPart, Solid, SolidMaterial, SolidShape};
 use source::Files;
 pub use springs::Springs;
 use toml_document::{Document, Fields, Item};
@@ -189,6 +191,8 @@ kinds! {
     Sheet,
     /// The surface of a triangle mesh.
     Mesh,
+    /// A lattice of cubes that fills a closed surface.
+    Solid,
 }
 
 /// Smallest side of a generated texture: 16 pixels. The largest is the limit `texture_side`.
@@ -655,7 +659,20 @@ impl Substance {
         })
     }
 
-    /// Applies inclusions, if this is a mesh, in place of a list applied before, on top of its factors; a sheet
+    /// Creates a solid without inclusions. Its k is E times the edge of a cube.
+    pub fn of_solid(solid: Solid) -> Self {
+        Substance {
+            springs: Springs::alike(solid.stiffness_n_per_m()),
+            damping_n_s_per_m: solid.damping_n_s_per_m(),
+            body: Body::Solid(solid),
+            material: None,
+            inclusions: Arc::default(),
+            anchor_stiffness_n_per_m: 0.0,
+            volume_stiffness_pa: 0.0,
+        }
+    }
+
+    /// Applies inclusions, if this is a mesh or a solid, in place of a list applied before, on top of its factors; a sheet
     /// stays as it is and its inclusions unchecked. `field` is the key of the list in refusals. Call it before
     /// [`Substance::enclosing`], since it drops the volume of the mesh.
     ///
@@ -663,10 +680,12 @@ impl Substance {
     /// Refuses everything that [`Inclusion::put_into`] refuses: too many inclusions, a value out of its range,
     /// an unknown group, and a ball that reaches no vertex.
     pub fn with(mut self, inclusions: Vec<Inclusion>, field: &str) -> Result<Self> {
-        if let Body::Mesh(mesh) = &mut self.body {
-            *mesh = Inclusion::put_into(&inclusions, field, mesh)?;
-            self.inclusions = inclusions.into();
+        match &mut self.body {
+            Body::Mesh(mesh) => *mesh = Inclusion::put_into(&inclusions, field, mesh)?,
+            Body::Solid(solid) => *solid = solid.with_inclusions(&inclusions, field)?,
+            Body::Sheet(_) => return Ok(self),
         }
+        self.inclusions = inclusions.into();
         Ok(self)
     }
 
@@ -696,22 +715,29 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
         return Err(other.refuse(Reason::WrongKind, message));
     }
     let section = first.map_or(Body::SECTIONS[0], |(section, _)| section);
-    if section != Mesh::SECTION {
-        if let Some(item) = material.as_ref().or(inclusions.as_ref()) {
-            return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
-        }
-        if let Some(item) = volume {
-            return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
-        }
+    if section == Sheet::SECTION
+        && let Some(item) = material.as_ref().or(inclusions.as_ref())
+    {
+        return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
+    }
+    if section != Mesh::SECTION
+        && let Some(item) = volume
+    {
+        return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
     }
     let body = fields.required(section)?.table(|fields| Body::read(section, fields, files, of_material, limits))?;
-    let Body::Mesh(mesh) = body else { return read_coefficients(fields, body) };
-    if mesh.shape.point_count() > limits.points {
-        mesh.check(limits)?;
-    }
-    let substance = match material {
-        None => read_coefficients(fields, Body::Mesh(mesh))?,
-        Some(item) => read_material(fields, &item, &mesh)?,
+    let substance = match (body, material) {
+        (Body::Solid(solid), material) => Substance::of_solid(solid::read_material(fields, &solid, material.as_ref())?),
+        (Body::Mesh(mesh), material) => {
+            if mesh.shape.point_count() > limits.points {
+                mesh.check(limits)?;
+            }
+            match material {
+                None => read_coefficients(fields, Body::Mesh(mesh))?,
+                Some(item) => read_material(fields, &item, &mesh)?,
+            }
+        }
+        (body, _) => return read_coefficients(fields, body),
     };
     let substance = match inclusions {
         Some(inclusions) => {

@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use palpate_geometry::TriangleMesh;
 use palpate_geometry::write::{Format, write};
 
-use super::Mesh;
 use super::source::unit_text;
+use super::{Mesh, Scene};
 use crate::files;
 use crate::limits::Limits;
 use crate::scene::toml_document::{Document, Fields};
 use palpate_refusal::Result;
 
-/// The mesh that the section `[mesh]` of a scene file names. Read from the text alone: the mesh file need not
+/// The mesh that the section `[mesh]` or `[solid]` of a scene file names. Read from the text alone: the mesh file need not
 /// exist.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshFile {
@@ -56,7 +56,10 @@ pub fn said(name: &str, text: &str) -> Result<Option<MeshFile>> {
         Ok(())
     };
     // Other errors do not matter here: reading the scene checks them.
-    let _ = document.read(|fields| fields.item("mesh").map_or(Ok(()), |item| item.table(read)));
+    let _ = document.read(|fields| {
+        let section = fields.item("mesh").or_else(|| fields.item("solid"));
+        section.map_or(Ok(()), |item| item.table(read))
+    });
     Ok(found)
 }
 
@@ -80,6 +83,15 @@ pub fn written(mesh: &Mesh) -> TriangleMesh {
 /// has other vertices; otherwise the simulated mesh, without them.
 pub fn file(mesh: &Mesh) -> (&'static str, Vec<u8>, &'static str) {
     ("mesh.obj", write(&written(mesh), Format::Obj), "m")
+}
+
+/// Returns the mesh that belongs to a scene besides its text as a file to send, as [`file()`] does; `None` if the text
+/// describes the whole tissue.
+pub fn file_of(scene: &Scene) -> Option<(&'static str, Vec<u8>, &'static str)> {
+    if let Some(mesh) = scene.mesh() {
+        return Some(file(mesh));
+    }
+    Some(("mesh.obj", write(&scene.body.kind().mesh()?, Format::Obj), "m"))
 }
 
 #[cfg(test)]

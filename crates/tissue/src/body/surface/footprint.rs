@@ -37,10 +37,19 @@ pub(crate) struct MeshDisc {
 impl MeshDisc {
     /// Creates a disc at an arbitrary place.
     pub(crate) fn new(shape: &Arc<MeshShape>, radius_m: f64) -> Self {
+        Self::with(shape, |edge_m| SurfaceDisc::new(radius_m, edge_m))
+    }
+
+    /// Creates a disc at an arbitrary place that averages over its whole area ([`SurfaceDisc::whole`]).
+    pub(crate) fn whole(shape: &Arc<MeshShape>, radius_m: f64) -> Self {
+        Self::with(shape, |edge_m| SurfaceDisc::whole(radius_m, edge_m))
+    }
+
+    fn with(shape: &Arc<MeshShape>, disc: impl FnOnce(f64) -> SurfaceDisc) -> Self {
         let surface = shape.surface();
         let nowhere = Place { triangle: 0, barycentric: [1.0 / 3.0; 3], frame: [DVec3::X, DVec3::Y] };
         let place = surface.nearest(DVec3::ZERO).unwrap_or(nowhere);
-        MeshDisc { shape: shape.clone(), disc: SurfaceDisc::new(radius_m, surface.edge_m()), place }
+        MeshDisc { shape: shape.clone(), disc: disc(surface.edge_m()), place }
     }
 }
 

@@ -7,6 +7,7 @@ use glam::DVec3;
 
 use super::order::{TABLES, TILE_SLOTS};
 use super::slots::{MeshSlots, NO_VERTEX};
+use crate::body::tile_links::TileLinks;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::real::Real;
 use crate::memory;
@@ -25,10 +26,7 @@ pub(crate) struct MeshPlaces {
     balls: Vec<(DVec3, f64)>,
     /// The ends of the box around each tile's points, m.
     boxes: Vec<[[f64; 2]; 3]>,
-    /// The slots beyond each tile that its springs reach, ascending; and where each tile's slots begin, with
-    /// the end of the last.
-    around: Vec<u32>,
-    firsts_around: Vec<usize>,
+    pub(crate) links: TileLinks,
     /// The smallest K″ of an anchored point of each tile divided by the reference value. Empty if all are 1.
     least_pulls: Vec<f64>,
     /// The smallest extra K″/m of any point, at most 0; and the largest relative mass.
@@ -104,16 +102,8 @@ impl MeshPlaces {
             let Extent { least_m, most_m } = Extent::around(places());
             std::array::from_fn(|axis| [least_m[axis], most_m[axis]])
         };
-        let (mut around, mut firsts_around) = (Vec::new(), vec![0]);
-        for tile in 0..slots.tiles() {
-            let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
-            let ends = own.clone().flat_map(|slot| slots.springs(slot)).map(|half| half.to);
-            let mut beyond: Vec<u32> = ends.filter(|slot| !own.contains(&(*slot as usize))).collect();
-            beyond.sort_unstable();
-            beyond.dedup();
-            around.extend(beyond);
-            firsts_around.push(around.len());
-        }
+        let joined = |slot: usize| slots.springs(slot).iter().map(|half| half.to as usize).collect();
+        let links = TileLinks::of([slots.blocks(), BLOCK], joined);
         let pulled = |tile: usize| {
             let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
             let own = own.filter(|slot| slots.vertex_of()[*slot] != NO_VERTEX);
@@ -125,18 +115,7 @@ impl MeshPlaces {
         let largest_mass = slots.masses().iter().copied().reduce(f64::max).unwrap_or(1.0);
         let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
         let volume = VolumePlaces::of(kind, &slots);
-        Ok(MeshPlaces {
-            volume,
-            balls,
-            boxes,
-            around,
-            firsts_around,
-            least_pulls,
-            least_extra,
-            largest_mass,
-            slots,
-            rest_m,
-        })
+        Ok(MeshPlaces { volume, balls, boxes, links, least_pulls, least_extra, largest_mass, slots, rest_m })
     }
 
     /// Returns the number of rows in memory.
@@ -191,18 +170,6 @@ impl MeshPlaces {
         self.least_pulls.get(tile).copied().unwrap_or(1.0)
     }
 
-    /// Returns the tiles that springs join to a tile, ascending.
-    pub(crate) fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        self.slots.neighbours(tile).iter().map(|other| *other as usize)
-    }
-
-    /// Returns the slots beyond a tile that its springs reach, ascending, and the place of the first in the
-    /// list of all tiles.
-    pub(crate) fn around(&self, tile: usize) -> (&[u32], usize) {
-        let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
-        (&self.around[from..to], from)
-    }
-
     /// Writes the falloff of `poke`, e^(−c·r) divided by the relative mass, over some rows, and which of them are not 0.
     pub(crate) fn fall_off<T: Real>(
         &self,
@@ -225,39 +192,5 @@ impl MeshPlaces {
             }
             spans.push(if any { 0..BLOCK } else { 0..0 });
         }
-    }
-
-    /// Stores where the points around a tile are.
-    pub(crate) fn remember<T: Real>(&self, layout: &Layout, tile: usize, u: &Field<T>, snapshots: &mut [T]) {
-        let (slots, first) = self.around(tile);
-        for c in 0..3 {
-            for (slot, k) in slots.iter().zip(0..) {
-                let place = c * layout.plane + layout.offset(*slot as usize);
-                snapshots[3 * first + c * slots.len() + k] = u[place];
-            }
-        }
-    }
-
-    /// Returns whether a point around a tile is more than `far` from where the tile remembers it.
-    pub(crate) fn has_moved<T: Real>(
-        &self,
-        layout: &Layout,
-        tile: usize,
-        u: &Field<T>,
-        snapshots: &[T],
-        far: T,
-    ) -> bool {
-        let (slots, first) = self.around(tile);
-        (0..3).any(|c| {
-            let place = |slot: &u32| c * layout.plane + layout.offset(*slot as usize);
-            let then = &snapshots[3 * first + c * slots.len()..][..slots.len()];
-            let any = |any: bool, (slot, then): (&u32, &T)| any | ((u[place(slot)] - *then).magnitude() > far);
-            slots.iter().zip(then).fold(false, any)
-        })
-    }
-
-    /// Returns the length of the list of all tiles' outside slots.
-    pub(crate) fn watched_slots(&self) -> usize {
-        self.around.len()
     }
 }

@@ -28,10 +28,12 @@ fn representative_m(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
 }
 
 impl Disc {
-    /// Returns the disc of `radius_m` (m) in the middle of the box around the tissue at rest: of a sheet, its middle;
-    /// of a mesh, the place nearest to the middle of the box.
+    /// Returns the disc of `radius_m` (m) that stands for the tissue ([`RestShape::pressed_m`]): in the middle of a sheet; on
+    /// a mesh, at the place nearest to the middle of the box around it; on top of a solid.
+    ///
+    /// [`RestShape::pressed_m`]: crate::shape::RestShape::pressed_m
     pub fn in_middle(model: &Model, radius_m: f64) -> Self {
-        Disc { radius_m, at_m: model.shape().extent().middle_m() }
+        Disc { radius_m, at_m: model.shape().pressed_m() }
     }
 
     /// Returns the rest position of the tissue that a tool with this disc and the contact `feel` presses or is about

@@ -1,0 +1,85 @@
+//! What joins the points of a part of a tissue, linearised at given displacements.
+
+use glam::{DMat3, DVec3};
+
+use crate::body::solid::linear::LinearCells;
+use crate::body::window::Spring;
+
+/// What joins the points of a part of a tissue.
+#[derive(Debug)]
+pub(crate) enum Bonds {
+    /// Springs.
+    Springs(Vec<Spring>),
+    /// Cubes.
+    Cells(LinearCells),
+}
+
+impl Bonds {
+    /// Returns the work of one multiplication, in springs. (A cube takes as long as ten.)
+    pub(crate) fn work(&self) -> usize {
+        match self {
+            Bonds::Springs(springs) => springs.len(),
+            Bonds::Cells(cells) => 10 * cells.len(),
+        }
+    }
+
+    /// Returns the springs; none in a solid.
+    pub(crate) fn springs(&self) -> &[Spring] {
+        if let Bonds::Springs(springs) = self { springs } else { &[] }
+    }
+
+    /// Computes forces and their derivatives at the present displacements of the points, m. Adds to `blocks` the
+    /// stiffness that holds each point if the others are held.
+    pub(crate) fn linearise(&mut self, displacement_m: &[DVec3], blocks: &mut [DMat3]) {
+        let springs = match self {
+            Bonds::Springs(springs) => springs,
+            Bonds::Cells(cells) => return cells.linearise(displacement_m, blocks),
+        };
+        for spring in springs {
+            let [a, b] = spring.ends;
+            let delta = displacement_m[b] - displacement_m[a];
+            let apart_m = spring.rest_m + delta;
+            let rest_squared = spring.rest_m.length_squared();
+            // 1 − L0/L without cancellation (`springs`).
+            let q = ((2.0 * spring.rest_m + delta).dot(delta) / rest_squared).max(1e-12 - 1.0);
+            let s = (1.0 + q).sqrt();
+            let stretch = q / (s * (1.0 + s));
+            let along = apart_m / (s * rest_squared.sqrt());
+            let outer = DMat3::from_cols(along * along.x, along * along.y, along * along.z);
+            let across = stretch.max(0.0);
+            spring.force_n = spring.stiffness_n_per_m * stretch * apart_m;
+            spring.tangent = spring.stiffness_n_per_m * (outer * (1.0 - across) + DMat3::IDENTITY * across);
+            blocks[a] += spring.tangent;
+            blocks[b] += spring.tangent;
+        }
+    }
+
+    /// Calls `add` with points and forces on them, N: all together are those at the displacements of
+    /// [`Bonds::linearise`].
+    pub(crate) fn forces(&self, mut add: impl FnMut(usize, DVec3)) {
+        match self {
+            Bonds::Springs(springs) => {
+                for spring in springs {
+                    add(spring.ends[0], spring.force_n);
+                    add(spring.ends[1], -spring.force_n);
+                }
+            }
+            Bonds::Cells(cells) => cells.forces(add),
+        }
+    }
+
+    /// Adds K·x for `N` vectors at once to `product`.
+    pub(crate) fn times<const N: usize>(&self, x: &[[DVec3; N]], product: &mut [[DVec3; N]]) {
+        let springs = match self {
+            Bonds::Springs(springs) => springs,
+            Bonds::Cells(cells) => return cells.times(x, product),
+        };
+        for Spring { ends: [a, b], tangent, .. } in springs {
+            for system in 0..N {
+                let pull = *tangent * (x[*b][system] - x[*a][system]);
+                product[*a][system] -= pull;
+                product[*b][system] += pull;
+            }
+        }
+    }
+}

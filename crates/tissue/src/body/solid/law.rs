@@ -1,0 +1,217 @@
+//! The force of a cube on its corners.
+//!
+//! **Material.** With H = ∂u/∂X, F = I + H, J = det F and Lamé's λ and μ, the energy of a volume is
+//!
+//! W = μ(½|H|² − tr cof H − det H) + ½(λ + μ)(J − 1)²:
+//!
+//! stable neo-Hookean without its logarithm (Smith, de Goes and Kim, ACM Transactions on Graphics 37(2), 2018,
+//! doi:10.1145/3180491), less its value at rest. With q = (λ + μ)(J − 1) − μ its derivative is
+//!
+//! P = μ·H + q·(cof H − Hᵀ) + (q + μ + q·tr H)·I,  J − 1 = tr H + tr cof H + det H,
+//!
+//! without a difference of large numbers at small H, and without a root, a division or a decomposition.
+//!
+//! **A cube.** A pattern is a sum of the corners' displacements with signs, σ_x σ_y σ_z = ±1. Three of the eight patterns
+//! give h = 4a·H; four are hourglasses, g₁ = Σ σ_y σ_z u, g₂ = Σ σ_x σ_z u, g₃ = Σ σ_x σ_y u, g₄ = Σ σ_x σ_y σ_z u: they
+//! move the corners without F at the middle. ∫ ½μ|F|² over the cube of edge a adds μa·(⅔(g₁² + g₂² + g₃²) + ⅓g₄²)/32 for
+//! them. With u in units of a, E·a = k and P in units of E, the force on a corner is
+//!
+//! −k/64·w·[(16 P)·σ + μ/E·(8/3·(g₁σ_yσ_z + g₂σ_xσ_z + g₃σ_xσ_y) + 4/3·g₄σ_xσ_yσ_z)],
+//!
+//! w the part of the cube that is there times its factor of E. A node's force is a sum over its eight cubes, here in
+//! fours: rows along x, with A (the part without σ_x) and B (the part with it); the near corner gets A − B, the far one
+//! A + B.
+//!
+//! **Limits.** The law stiffens as λ|cof F|². So that a substep that is stable at rest stays stable however far the tissue
+//! is pressed, the pressure (λ + μ)(J − 1) is multiplied by min(1, [`SOFTENS`]/|cof F|²) and limited to ±[`LARGEST`]·μ.
+//! (Pressed by half of its height, a block gives way by 0.1 % more. Cubes that are turned inside out come back.)
+#![allow(clippy::needless_range_loop)]
+
+use crate::kernel::lanes::Vector;
+use crate::kernel::real::Real;
+
+/// |cof F|² from which on the pressure is reduced; 3 at rest.
+const SOFTENS: f64 = 3.5;
+
+/// The largest pressure, in μ.
+const LARGEST: f64 = 5.0;
+
+/// Coefficients of a material's cubes, in units of a scheme.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CellLaw<T> {
+    /// c·μ/E, where c is k/64 times the factor to the scheme's units of force.
+    shear: T,
+    /// c·(λ + μ)/E/4, the factor of 64(J − 1) in 16 times the pressure.
+    bulk: T,
+}
+
+/// The force of a cube on the rows of its corners along x, by component: near in y and z, far in y, far in z, far in both.
+pub(crate) struct RowForces<V> {
+    /// The mean force of both corners of a row.
+    pub(crate) even: [[V; 4]; 3],
+    /// Half the difference: the corner farther along x gets even + odd, the other one even − odd.
+    pub(crate) odd: [[V; 4]; 3],
+}
+
+/// The patterns of a cube: h and the hourglasses g₁ to g₄, by component.
+pub(super) struct Patterns<V> {
+    pub(super) h: [[V; 3]; 3],
+    pub(super) g: [[V; 4]; 3],
+}
+
+/// Returns the patterns of one component, from the sums and differences along x of the four rows.
+#[inline(always)]
+fn patterns<V: Vector>([s00, s10, s01, s11]: [V; 4], [d00, d10, d01, d11]: [V; 4]) -> ([V; 3], [V; 4]) {
+    // Along y, near and far in z.
+    let (ss0, sd0, ds0, dd0) = (s10.add(s00), s10.sub(s00), d10.add(d00), d10.sub(d00));
+    let (ss1, sd1, ds1, dd1) = (s11.add(s01), s11.sub(s01), d11.add(d01), d11.sub(d01));
+    ([ds1.add(ds0), sd1.add(sd0), ss1.sub(ss0)], [sd1.sub(sd0), ds1.sub(ds0), dd1.add(dd0), dd1.sub(dd0)])
+}
+
+impl<T: Real> CellLaw<T> {
+    /// Creates the law of a material with μ/E = `shear` and λ/E = `lame`. `stiffness` is k = E·a times the factor to the
+    /// scheme's units of force.
+    pub(crate) fn new(stiffness: f64, shear: f64, lame: f64) -> Self {
+        let unit = stiffness / 64.0;
+        CellLaw { shear: T::of(unit * shear), bulk: T::of(unit * (lame + shear) / 4.0) }
+    }
+
+    /// Returns the forces of cubes of weight `w`. `near` has the displacements of the corners nearer along x, by component
+    /// and row, `far` those of the others.
+    #[inline(always)]
+    pub(crate) fn forces<V: Vector<Real = T>>(&self, w: V, near: &[[V; 4]; 3], far: &[[V; 4]; 3]) -> RowForces<V> {
+        let Patterns { h, g } = Self::all_patterns(near, far);
+        let shear = w.mul(w.splat(self.shear));
+        let bulk = w.mul(w.splat(self.bulk));
+        let (cofactor, trace, growth) = invariants(&h);
+        let pressure = limited(&cofactor, trace, bulk.mul(growth), shear);
+        // 16 P, all times the weight: 4μ·h + q·(cof h − 4hᵀ) + (16 p + 4 q·tr h)·I, here q = p − μ and `pressure` 16 p.
+        let (sixteenth, four) = (w.splat(T::of(0.0625)), w.splat(T::of(4.0)));
+        let q = pressure.mul(sixteenth).sub(shear);
+        let (shear_four, q_four) = (shear.mul(four), q.mul(four));
+        let spherical = q_four.mul_add(trace, pressure);
+        let zero = w.splat(T::default());
+        let mut p = [[zero; 3]; 3];
+        for c in 0..3 {
+            for along in 0..3 {
+                let own =
+                    if c == along { shear_four.mul_add(h[c][along], spherical) } else { shear_four.mul(h[c][along]) };
+                p[c][along] = q.mul_add(cofactor[c][along], own);
+            }
+        }
+        spread(&p, &g, shear)
+    }
+
+    /// Returns the energy of cubes, in the scheme's units of force times edges: as [`CellLaw::forces`], without the limits
+    /// but with the reduced pressure.
+    #[inline(always)]
+    pub(crate) fn energy<V: Vector<Real = T>>(&self, w: V, near: &[[V; 4]; 3], far: &[[V; 4]; 3]) -> V {
+        let Patterns { h, g } = Self::all_patterns(near, far);
+        let shear = w.mul(w.splat(self.shear));
+        let bulk = w.mul(w.splat(self.bulk));
+        let (cofactor, trace, growth) = invariants(&h);
+        let zero = w.splat(T::default());
+        let (mut squares, mut hours) = (zero, zero);
+        for c in 0..3 {
+            for along in 0..3 {
+                squares = h[c][along].mul_add(h[c][along], squares);
+                hours = g[c][along].mul_add(g[c][along], hours);
+            }
+        }
+        let mut last = zero;
+        for c in 0..3 {
+            last = g[c][3].mul_add(g[c][3], last);
+        }
+        // 64(J − 1) = 16 tr h + 4 tr cof h + det h: so what is subtracted, 4 tr cof h + det h, is this less 16 tr h.
+        let less = growth.sub(w.splat(T::of(16.0)).mul(trace));
+        let of_h = w.splat(T::of(2.0)).mul_add(squares, zero.sub(less));
+        let of_g = w.splat(T::of(4.0 / 3.0)).mul_add(hours, w.splat(T::of(2.0 / 3.0)).mul(last));
+        let pressure = limited(&cofactor, trace, bulk.mul(growth), shear);
+        // ½ p·64(J − 1), where 16 p is known, and with c in it: ½·(16 p)·64(J − 1)/16.
+        let swelling = pressure.mul(growth).mul(w.splat(T::of(1.0 / 32.0)));
+        shear.mul_add(of_h.add(of_g), swelling)
+    }
+
+    /// Returns the patterns of cubes.
+    #[inline(always)]
+    pub(super) fn all_patterns<V: Vector<Real = T>>(near: &[[V; 4]; 3], far: &[[V; 4]; 3]) -> Patterns<V> {
+        let zero = near[0][0];
+        let mut all = Patterns { h: [[zero; 3]; 3], g: [[zero; 4]; 3] };
+        for c in 0..3 {
+            let (mut sums, mut differences) = ([zero; 4], [zero; 4]);
+            for row in 0..4 {
+                sums[row] = far[c][row].add(near[c][row]);
+                differences[row] = far[c][row].sub(near[c][row]);
+            }
+            (all.h[c], all.g[c]) = patterns(sums, differences);
+        }
+        all
+    }
+}
+
+/// Returns the forces on the corners of cubes from 16 P and the hourglasses, both times the weight: `shear` is that of μ/E.
+#[inline(always)]
+pub(super) fn spread<V: Vector>(p: &[[V; 3]; 3], g: &[[V; 4]; 3], shear: V) -> RowForces<V> {
+    let zero = shear.splat(V::Real::default());
+    let (hour_three, hour_one) =
+        (shear.mul(zero.splat(V::Real::of(8.0 / 3.0))), shear.mul(zero.splat(V::Real::of(4.0 / 3.0))));
+    let mut forces = RowForces { even: [[zero; 4]; 3], odd: [[zero; 4]; 3] };
+    for c in 0..3 {
+        let [px, py, pz] = p[c];
+        let [g1, g2, g3, g4] = g[c];
+        let (py_less, py_more) = (py.minus(hour_three, g1), hour_three.mul_add(g1, py));
+        forces.even[c] = [zero.sub(py_less).sub(pz), py_less.sub(pz), pz.sub(py_more), pz.add(py_more)];
+        let (px_less, px_more) = (px.minus(hour_three, g2), hour_three.mul_add(g2, px));
+        let third = hour_three.mul(g3);
+        let (third_less, third_more) = (third.minus(hour_one, g4), hour_one.mul_add(g4, third));
+        forces.odd[c] =
+            [px_less.sub(third_less), px_less.add(third_less), px_more.sub(third_more), px_more.add(third_more)];
+    }
+    forces
+}
+
+/// Returns cof h − 4hᵀ (16 times cof F less its diagonal part), tr h, and 64(J − 1).
+#[inline(always)]
+pub(super) fn invariants<V: Vector>(h: &[[V; 3]; 3]) -> ([[V; 3]; 3], V, V) {
+    let zero = h[0][0].splat(V::Real::default());
+    let (four, sixteen) = (zero.splat(V::Real::of(4.0)), zero.splat(V::Real::of(16.0)));
+    let mut cofactor = [[zero; 3]; 3];
+    for i in 0..3 {
+        let (i1, i2) = ((i + 1) % 3, (i + 2) % 3);
+        for j in 0..3 {
+            let (j1, j2) = ((j + 1) % 3, (j + 2) % 3);
+            cofactor[i][j] = h[i1][j1].mul(h[i2][j2]).minus(h[i1][j2], h[i2][j1]);
+        }
+    }
+    let trace = h[0][0].add(h[1][1]).add(h[2][2]);
+    let of_cofactor = cofactor[0][0].add(cofactor[1][1]).add(cofactor[2][2]);
+    let determinant = h[0][2].mul_add(cofactor[0][2], h[0][1].mul_add(cofactor[0][1], h[0][0].mul(cofactor[0][0])));
+    let growth = sixteen.mul_add(trace, four.mul_add(of_cofactor, determinant));
+    for i in 0..3 {
+        for j in 0..3 {
+            cofactor[i][j] = cofactor[i][j].minus(four, h[j][i]);
+        }
+    }
+    (cofactor, trace, growth)
+}
+
+/// Returns 16 times a pressure, reduced and limited. `cofactor` and `trace` are those of [`invariants`].
+#[inline(always)]
+fn limited<V: Vector>(cofactor: &[[V; 3]; 3], trace: V, pressure: V, shear: V) -> V {
+    let of = |value: f64| trace.splat(V::Real::of(value));
+    // 16 cof F = 16 + 4 tr h on the diagonal, and the rest.
+    let diagonal = of(4.0).mul_add(trace, of(16.0));
+    let mut squares = of(0.0);
+    for i in 0..3 {
+        for j in 0..3 {
+            let value = if i == j { cofactor[i][j].add(diagonal) } else { cofactor[i][j] };
+            squares = value.mul_add(value, squares);
+        }
+    }
+    let most = of(256.0 * SOFTENS);
+    let pressure = pressure.mul(most.div(squares.larger(most)));
+    let largest = of(16.0 * LARGEST).mul(shear);
+    let zero = of(0.0);
+    let above = pressure.larger(zero.sub(largest));
+    zero.sub(zero.sub(above).larger(zero.sub(largest)))
+}

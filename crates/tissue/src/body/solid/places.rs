@@ -1,0 +1,228 @@
+//! The corners of a lattice in memory: which are points, what they weigh, and the cubes around them.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use crate::body::tile_links::TileLinks;
+use crate::kernel::field::{BLOCK, Field, Layout};
+use crate::kernel::real::Real;
+use crate::memory;
+use crate::scene::profile::Poke;
+use crate::scene::{Solid, SolidShape};
+use crate::shape::{PointId, RestShape};
+
+/// Name of the tables in messages.
+const TABLES: &str = "the cubes of a solid";
+
+/// The places of a solid. A place is a corner of the lattice: x runs fastest, then y.
+#[derive(Debug)]
+pub(crate) struct SolidPlaces {
+    shape: Arc<SolidShape>,
+    /// Corners along each axis.
+    corners: [usize; 3],
+    /// The weight of the cube of which each place is the least corner: its part times its factor of E.
+    weights: Vec<f64>,
+    /// The relative mass of each place; 0 where there is no point.
+    masses: Vec<f64>,
+    pub(crate) largest_mass: f64,
+    /// The point at each place; 0 where there is none.
+    point_at: Vec<u32>,
+    place_of: Vec<u32>,
+    pub(crate) links: TileLinks,
+    /// μ/E and λ/E.
+    lame_over_youngs: [f64; 2],
+}
+
+impl SolidPlaces {
+    /// Lays out a solid.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn of(solid: &Solid) -> Self {
+        let shape = solid.shape.clone();
+        let lattice = shape.lattice();
+        let corners = lattice.cells.map(|cells| cells + 1);
+        let count: usize = corners.iter().product();
+        let mut weights = memory::zeroed(count, TABLES);
+        for (cell, weight) in solid.weights().iter().enumerate() {
+            let [x, y, _] = lattice.cells;
+            let [i, j, k] = [cell % x, cell / x % y, cell / x / y];
+            weights[(k * corners[1] + j) * corners[0] + i] = *weight;
+        }
+        let (mut masses, mut point_at) = (memory::zeroed(count, TABLES), memory::zeroed(count, TABLES));
+        let points = crate::shape::points(&*shape);
+        let place_of: Vec<u32> = memory::collected(points.clone().map(|point| shape.corner_of(point) as u32), TABLES);
+        for point in points {
+            let place = shape.corner_of(point);
+            masses[place] = crate::scene::BodyKind::relative_mass(solid, point);
+            point_at[place] = point.index() as u32;
+        }
+        let largest_mass = masses.iter().copied().fold(0.0, f64::max);
+        let mut places = SolidPlaces {
+            shape,
+            corners,
+            weights,
+            masses,
+            largest_mass,
+            point_at,
+            place_of,
+            links: TileLinks::default(),
+            lame_over_youngs: [solid.material.shear_over_youngs(), solid.material.lame_over_youngs()],
+        };
+        places.links = TileLinks::of([corners[1] * corners[2], corners[0]], |place| places.beside(place));
+        places
+    }
+
+    /// Returns the number of rows and of columns in memory.
+    pub(crate) fn size(&self) -> [usize; 2] {
+        [self.corners[1] * self.corners[2], self.corners[0]]
+    }
+
+    /// Returns Lamé's μ and λ divided by E.
+    pub(crate) fn lame_over_youngs(&self) -> [f64; 2] {
+        self.lame_over_youngs
+    }
+
+    /// Returns the number of places.
+    pub(crate) fn count(&self) -> usize {
+        self.masses.len()
+    }
+
+    /// Returns the number of rows of a plane across z.
+    pub(crate) fn rows_per_plane(&self) -> usize {
+        self.corners[1]
+    }
+
+    /// Returns the places that never move, ascending: those of fixed points, and those without a point.
+    pub(crate) fn fixed(&self) -> Vec<usize> {
+        let is_fixed = |place: &usize| self.masses[*place] == 0.0 || self.shape.is_fixed(self.point_at(*place));
+        (0..self.count()).filter(is_fixed).collect()
+    }
+
+    pub(crate) fn mass(&self, place: usize) -> f64 {
+        self.masses[place]
+    }
+
+    pub(crate) fn weight(&self, place: usize) -> f64 {
+        self.weights[place]
+    }
+
+    pub(crate) fn place_of(&self, point: PointId) -> usize {
+        self.place_of[point.index()] as usize
+    }
+
+    /// Returns the point at a place; the first point where there is none.
+    pub(crate) fn point_at(&self, place: usize) -> PointId {
+        PointId::new(self.point_at[place] as usize)
+    }
+
+    /// Returns the point at each place, and the place of each point.
+    pub(crate) fn order(&self) -> [&[u32]; 2] {
+        [&self.point_at, &self.place_of]
+    }
+
+    /// Returns the rest position of a place, m.
+    pub(crate) fn rest_m(&self, place: usize) -> DVec3 {
+        let lattice = self.shape.lattice();
+        #[allow(clippy::cast_precision_loss)]
+        let at = self.axes_of(place).map(|at| at as f64);
+        lattice.origin_m + lattice.edge_m * DVec3::from_array(at)
+    }
+
+    #[inline(always)]
+    fn axes_of(&self, place: usize) -> [usize; 3] {
+        let [x, y, _] = self.corners;
+        [place % x, place / x % y, place / x / y]
+    }
+
+    /// Returns the places of the corners of the cube of which `cube` is the least corner: those farther along x after the
+    /// nearer ones, then along y, then along z.
+    #[inline(always)]
+    pub(crate) fn corners_of(&self, cube: usize) -> [usize; 8] {
+        let [x, y, _] = self.corners;
+        let (across, up) = (cube + x, cube + x * y);
+        [cube, cube + 1, across, across + 1, up, up + 1, up + x, up + x + 1]
+    }
+
+    /// Returns the cubes of which a place is a corner, `beside` (0 or 1) before it along x: in its own row, one row before
+    /// along y, one before along z, and both. `None` where there is no cube.
+    #[inline(always)]
+    pub(crate) fn cubes_around(&self, place: usize, beside: usize) -> [Option<usize>; 4] {
+        let [i, j, k] = self.axes_of(place);
+        let [x, y, _] = self.corners;
+        let mut cubes = [None; 4];
+        for (row, cube) in cubes.iter_mut().enumerate() {
+            let (by_y, by_z) = (row & 1, row >> 1);
+            if i >= beside && j >= by_y && k >= by_z {
+                let least = place - beside - by_y * x - by_z * x * y;
+                *cube = (self.weights[least] > 0.0).then_some(least);
+            }
+        }
+        cubes
+    }
+
+    /// Returns the places that share a cube with a place, with itself; some twice.
+    fn beside(&self, place: usize) -> Vec<usize> {
+        let cubes = [0, 1].into_iter().flat_map(|beside| self.cubes_around(place, beside)).flatten();
+        cubes.flat_map(|cube| self.corners_of(cube)).collect()
+    }
+
+    /// Returns the first and the end of the rows and columns within a distance of a place.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(crate) fn reached(&self, centre_m: DVec3, reach_m: f64) -> [[usize; 2]; 2] {
+        let lattice = self.shape.lattice();
+        let [least, most] = [-reach_m, reach_m].map(|by_m| lattice.from_m(centre_m + by_m));
+        // Saturating casts: a reach may be infinite.
+        let range = |axis: usize| {
+            let end = ((most[axis].floor() + 1.0).max(0.0) as usize).min(self.corners[axis]);
+            [(least[axis].ceil().max(0.0) as usize).min(end), end]
+        };
+        let [x, y, z] = [range(0), range(1), range(2)];
+        if [x, y, z].iter().any(|[from, to]| from == to) {
+            return [[0, 0], [0, 0]];
+        }
+        let rows = self.rows_per_plane();
+        [[z[0] * rows + y[0], (z[1] - 1) * rows + y[1]], [x[0] / BLOCK * BLOCK, x[1].next_multiple_of(BLOCK)]]
+    }
+
+    /// Returns the ends of the box around some rows and columns along each axis, m.
+    pub(crate) fn box_of(&self, [rows, columns]: &[Range<usize>; 2]) -> [[f64; 2]; 3] {
+        let lattice = self.shape.lattice();
+        let y = self.corners[1];
+        let [first, last] = [rows.start / y, (rows.end - 1) / y];
+        // Rows of several planes may be anywhere along y.
+        let along_y = if first == last { [rows.start % y, (rows.end - 1) % y] } else { [0, y - 1] };
+        let ends = [[columns.start, columns.end - 1], along_y, [first, last]];
+        #[allow(clippy::cast_precision_loss)]
+        let at_m = |axis: usize, corner: usize| lattice.origin_m[axis] + lattice.edge_m * corner as f64;
+        std::array::from_fn(|axis| ends[axis].map(|corner| at_m(axis, corner)))
+    }
+
+    /// Writes the falloff of `poke`, e^(−c·r) divided by the relative mass, over some rows and columns, and which part of
+    /// each row is not 0.
+    pub(crate) fn fall_off<T: Real>(
+        &self,
+        poke: &Poke,
+        layout: &Layout,
+        [rows, columns]: [Range<usize>; 2],
+        factors: &mut Field<T>,
+        spans: &mut Vec<Range<usize>>,
+    ) {
+        spans.clear();
+        let columns = columns.start..columns.end.min(layout.columns);
+        for (factors, row) in factors.chunks_exact_mut(layout.stride).zip(rows) {
+            let (mut first, mut end) = (usize::MAX, 0);
+            for column in columns.clone() {
+                let place = row * layout.columns + column;
+                let mass = self.masses[place];
+                let exponent = -poke.falloff_per_m * self.rest_m(place).distance(poke.centre_m);
+                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && mass > 0.0;
+                factors[column] = if reaches { T::of(libm::exp(exponent) / mass) } else { T::default() };
+                if factors[column] != T::default() {
+                    (first, end) = (first.min(column), column + 1);
+                }
+            }
+            spans.push(if first < end { first / BLOCK * BLOCK..end.next_multiple_of(BLOCK) } else { 0..0 });
+        }
+    }
+}

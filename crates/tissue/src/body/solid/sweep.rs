@@ -1,0 +1,262 @@
+//! The sweep over a lattice: evaluates every cube once, row by row, and advances the corners behind it, in place.
+//!
+//! Row (j, k) of cubes acts on the rows (j, k), (j + 1, k), (j, k + 1) and (j + 1, k + 1) of corners. What the sweep still
+//! needs of it waits: for (j + 1, k) in a row, for (j, k + 1) in a plane, for (j + 1, k + 1) in a row that the next row of
+//! cubes adds to the plane. When cube row (j, k) is done, all forces on corner row (j, k) are known and nothing reads its
+//! displacements again. All of it is kept as even and odd parts along x ([`law`](super::law)): the force on corner i is
+//!
+//! (odd − even) of cube i − (even + odd) of cube i − 1,  each the sum (plane + row) + own.
+//!
+//! A lane's result depends on the same operations in the same order at every width. Blocks of eight columns without a
+//! cube are skipped; a cube of weight 0 has a force of 0, so this changes no bit either.
+#![allow(unsafe_code)]
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
+// times slower.
+#![allow(clippy::needless_range_loop)]
+
+use std::cell::RefCell;
+use std::ops::Range;
+
+use super::law::CellLaw;
+use super::places::SolidPlaces;
+use crate::kernel::field::{BLOCK, Field, Layout};
+use crate::kernel::lanes::{Run, Scalar, Vector};
+use crate::kernel::real::Real;
+use crate::kernel::region::Region;
+use crate::kernel::stage::{ANY, Stage};
+
+/// Columns of which the sweep knows together whether there is a cube.
+const GROUP: usize = 8;
+
+/// A group has cubes; or corners alone; or neither.
+const CUBES: u8 = 2;
+const CORNERS_ALONE: u8 = 1;
+
+/// The tables of a sweep over a lattice.
+#[derive(Debug)]
+pub(crate) struct SolidTables<T> {
+    /// For each place, the weight of the cube of which it is the least corner: one plane.
+    weights: Field<T>,
+    /// For each place, 1 divided by its relative mass; 0 where there is no point.
+    mobility: Field<T>,
+    /// For each place, its relative mass; 0 where there is no point.
+    pub(crate) masses: Field<T>,
+    /// For each group of columns of each row, what is there.
+    groups: Vec<u8>,
+    /// The columns of each row that have corners or act on some, in whole blocks.
+    spans: Vec<Range<usize>>,
+    waiting: RefCell<Field<T>>,
+}
+
+impl<T: Real> SolidTables<T> {
+    /// Creates the tables of a lattice.
+    pub(crate) fn new(places: &SolidPlaces, layout: &Layout) -> Self {
+        let mut tables = SolidTables {
+            weights: Field::of_length(layout.plane),
+            mobility: Field::of_length(layout.plane),
+            masses: Field::of_length(layout.plane),
+            groups: vec![0; layout.plane.div_ceil(GROUP)],
+            spans: vec![0..0; layout.rows],
+            waiting: RefCell::new(Field::of_length(6 * (places.rows_per_plane() + 2) * layout.stride + BLOCK)),
+        };
+        let mut reached = vec![[usize::MAX, 0]; layout.rows];
+        for place in 0..places.count() {
+            let at = layout.offset(place);
+            let (mass, weight) = (places.mass(place), places.weight(place));
+            if mass > 0.0 {
+                tables.masses[at] = T::of(mass);
+                tables.mobility[at] = T::of(mass.recip());
+                tables.groups[at / GROUP] = tables.groups[at / GROUP].max(CORNERS_ALONE);
+                let (row, column) = (place / layout.columns, place % layout.columns);
+                let [first, end] = &mut reached[row];
+                (*first, *end) = ((*first).min(column), (*end).max(column + 1));
+            }
+            if weight > 0.0 {
+                tables.weights[at] = T::of(weight);
+                tables.groups[at / GROUP] = CUBES;
+            }
+        }
+        for (span, [first, end]) in tables.spans.iter_mut().zip(reached) {
+            if first < end {
+                *span = first / BLOCK * BLOCK..end.next_multiple_of(BLOCK);
+            }
+        }
+        tables
+    }
+}
+
+/// What a sweep reads.
+pub(crate) struct SolidGrid<'a, T> {
+    pub(crate) layout: Layout,
+    pub(crate) places: &'a SolidPlaces,
+    pub(crate) tables: &'a SolidTables<T>,
+    pub(crate) law: &'a CellLaw<T>,
+    /// Displacements: three planes, edges of cubes.
+    pub(crate) x: *const T,
+}
+
+/// A sweep over a lattice, ready to run at any width.
+pub(crate) struct SolidSweep<'a, T, S> {
+    pub(crate) grid: SolidGrid<'a, T>,
+    pub(crate) over: &'a Region,
+    pub(crate) stage: S,
+}
+
+impl<T: Real, S: Stage<T>> Run<T> for SolidSweep<'_, T, S> {
+    #[inline(always)]
+    unsafe fn run<V: Vector<Real = T>>(&self) {
+        let SolidGrid { layout, places, tables, .. } = &self.grid;
+        let rows = places.rows_per_plane();
+        let mut waiting = tables.waiting.borrow_mut();
+        assert!(waiting.len() == 6 * (rows + 2) * layout.stride + BLOCK && tables.weights.len() == layout.plane);
+        waiting.fill(T::default());
+        let waiting = waiting.as_mut_ptr();
+        let all_awake = self.over.awake.is_full();
+        // SAFETY: the caller's promise, and the tables are those of the layout.
+        unsafe {
+            let mut sums = self.stage.begin::<V>();
+            for k in 0..layout.rows / rows {
+                for j in 0..rows {
+                    // `black_box` hides `j` from the compiler, which would otherwise keep an address for each array.
+                    self.row::<V>(std::hint::black_box(j), k, waiting, all_awake, &mut sums);
+                    self.stage.end_row();
+                }
+            }
+            self.stage.end(sums);
+        }
+    }
+}
+
+impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
+    /// Sweeps over row (j, k).
+    ///
+    /// # Safety
+    /// `x` has the layout's planes; `waiting` has 6 rows for each row of a plane and two more.
+    #[inline(always)]
+    unsafe fn row<V: Vector<Real = T>>(&self, j: usize, k: usize, waiting: *mut T, all_awake: bool, sums: &mut [V; 2]) {
+        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, law, x, .. } = self.grid;
+        let rows = places.rows_per_plane();
+        let (row, layer) = (k * rows + j, stride * rows);
+        let at_row = row * stride;
+        // SAFETY: the caller's promise.
+        unsafe {
+            let zero = V::of(T::default());
+            let of_plane = waiting.add(6 * j * stride);
+            let (of_row, of_corner) = (waiting.add(6 * rows * stride), waiting.add(6 * (rows + 1) * stride));
+            let mut before = [zero; 3];
+            let span = tables.spans[row].clone();
+            let mut column = span.start;
+            while column < span.end {
+                let at = at_row + column;
+                let group = *tables.groups.get_unchecked(at / GROUP);
+                let group =
+                    if V::LANES > GROUP { group.max(*tables.groups.get_unchecked(at / GROUP + 1)) } else { group };
+                let (mut even, mut odd) = ([zero; 3], [zero; 3]);
+                for c in 0..3 {
+                    let place = 2 * c * stride + column;
+                    even[c] = V::load(of_plane.add(place)).add(V::load(of_row.add(place)));
+                    odd[c] = V::load(of_plane.add(place + stride)).add(V::load(of_row.add(place + stride)));
+                }
+                if group == CUBES {
+                    let w = V::load(tables.weights.as_ptr().add(at));
+                    let (mut near, mut far) = ([[zero; 4]; 3], [[zero; 4]; 3]);
+                    for c in 0..3 {
+                        let from = x.add(c * plane + at);
+                        for (row, by) in [0, stride, layer, layer + stride].into_iter().enumerate() {
+                            near[c][row] = V::load(from.add(by));
+                            far[c][row] = V::load(from.add(by + 1));
+                        }
+                    }
+                    if S::ENERGY {
+                        self.stage.energy(column, law.energy(w, &near, &far));
+                    }
+                    let forces = law.forces(w, &near, &far);
+                    for c in 0..3 {
+                        for (part, own, sum) in [(0, &forces.even[c], &mut even[c]), (1, &forces.odd[c], &mut odd[c])] {
+                            let place = (2 * c + part) * stride + column;
+                            let corner = of_corner.add(place);
+                            *sum = sum.add(own[0]);
+                            own[1].store(of_row.add(place));
+                            own[2].add(V::load(corner)).store(of_plane.add(place));
+                            own[3].store(corner);
+                        }
+                    }
+                } else {
+                    for part in 0..6 {
+                        let place = part * stride + column;
+                        V::load(of_corner.add(place)).store(of_plane.add(place));
+                        zero.store(of_row.add(place));
+                        zero.store(of_corner.add(place));
+                    }
+                }
+                if group == 0 {
+                    before = [zero; 3];
+                    column += V::LANES;
+                    continue;
+                }
+                let mobility = V::load(tables.mobility.as_ptr().add(at));
+                let (mut here, mut n) = ([zero; 3], [zero; 3]);
+                for c in 0..3 {
+                    let passed = even[c].add(odd[c]);
+                    n[c] = odd[c].sub(even[c]).sub(passed.shift(before[c])).mul(mobility);
+                    before[c] = passed;
+                    here[c] = V::load(x.add(c * plane + at));
+                }
+                if all_awake || self.over.is_awake(row, column) {
+                    self.stage.finish::<V, ANY>(row, at, here, n, sums);
+                }
+                column += V::LANES;
+            }
+        }
+    }
+}
+
+/// Returns the force on a place divided by its relative mass, with the bits of a sweep.
+#[inline(always)]
+pub(crate) fn gather<T: Real>(
+    places: &SolidPlaces,
+    law: &CellLaw<T>,
+    layout: &Layout,
+    u: &[T],
+    place: usize,
+) -> [T; 3] {
+    let zero = Scalar(T::default());
+    // Even and odd parts of the rows (j, k), (j − 1, k), (j, k − 1) and (j − 1, k − 1) of cubes, on the row of the place;
+    // first those of the cubes at the place, then those of the cubes before them along x.
+    let mut parts = [[[[zero; 4]; 3]; 2]; 2];
+    for beside in 0..2 {
+        let cubes = places.cubes_around(place, beside);
+        for row in 0..4 {
+            let Some(cube) = cubes[row] else { continue };
+            let corners = places.corners_of(cube);
+            let (mut near, mut far) = ([[zero; 4]; 3], [[zero; 4]; 3]);
+            for of_cube in 0..4 {
+                let (here, beyond) = (layout.offset(corners[2 * of_cube]), layout.offset(corners[2 * of_cube + 1]));
+                for c in 0..3 {
+                    near[c][of_cube] = Scalar(u[c * layout.plane + here]);
+                    far[c][of_cube] = Scalar(u[c * layout.plane + beyond]);
+                }
+            }
+            let forces = law.forces(Scalar(T::of(places.weight(cube))), &near, &far);
+            for c in 0..3 {
+                parts[beside][0][c][row] = forces.even[c][row];
+                parts[beside][1][c][row] = forces.odd[c][row];
+            }
+        }
+    }
+    let mobility = if places.mass(place) > 0.0 { Scalar(T::of(places.mass(place).recip())) } else { zero };
+    let mut found = [T::default(); 3];
+    for c in 0..3 {
+        // In the order of the sweep: of the plane before, of the row before, own.
+        let mut sums = [[zero; 2]; 2];
+        for beside in 0..2 {
+            for part in 0..2 {
+                let rows = parts[beside][part][c];
+                sums[beside][part] = rows[2].add(rows[3]).add(rows[1]).add(rows[0]);
+            }
+        }
+        let [[even, odd], [even_before, odd_before]] = sums;
+        found[c] = odd.sub(even).sub(even_before.add(odd_before)).mul(mobility).0;
+    }
+    found
+}

@@ -1,0 +1,99 @@
+//! Which tiles of a tissue are joined by what pulls between its places, for a tissue whose places are joined in any way.
+
+use std::ops::Range;
+
+use crate::kernel::field::{Field, Layout};
+use crate::kernel::real::Real;
+use crate::kernel::region::{TILE, tiles};
+
+/// The tiles next to each tile, and the places beyond a tile that pull at it.
+#[derive(Debug, Default)]
+pub(crate) struct TileLinks {
+    /// The places beyond each tile that are joined to it, ascending; and where each tile's places begin, with the end of
+    /// the last.
+    around: Vec<u32>,
+    firsts_around: Vec<usize>,
+    /// The tiles of these places, ascending, in the same way.
+    beside: Vec<u32>,
+    firsts_beside: Vec<usize>,
+}
+
+impl TileLinks {
+    /// Finds the links of places in rows and columns. `joined` returns the places that pull at a place.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn of(size @ [rows, columns]: [usize; 2], joined: impl Fn(usize) -> Vec<usize>) -> Self {
+        let across = tiles(columns);
+        let tile_of = |place: usize| place / columns / TILE * across + place % columns / TILE;
+        let mut links = TileLinks { firsts_around: vec![0], firsts_beside: vec![0], ..TileLinks::default() };
+        for tile in 0..tiles(rows) * across {
+            let places = places_of(size, tile);
+            let mut beyond: Vec<u32> =
+                places.flat_map(&joined).filter(|place| tile_of(*place) != tile).map(|place| place as u32).collect();
+            beyond.sort_unstable();
+            beyond.dedup();
+            let mut beside: Vec<u32> = beyond.iter().map(|place| tile_of(*place as usize) as u32).collect();
+            beside.sort_unstable();
+            beside.dedup();
+            links.around.extend(beyond);
+            links.beside.extend(beside);
+            links.firsts_around.push(links.around.len());
+            links.firsts_beside.push(links.beside.len());
+        }
+        links
+    }
+
+    /// Returns the tiles that are joined to a tile, ascending.
+    pub(crate) fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
+        let range = self.firsts_beside[tile]..self.firsts_beside[tile + 1];
+        self.beside[range].iter().map(|other| *other as usize)
+    }
+
+    /// Returns the places beyond a tile that are joined to it, ascending, and the place of the first in the list of all
+    /// tiles.
+    pub(crate) fn around(&self, tile: usize) -> (&[u32], usize) {
+        let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
+        (&self.around[from..to], from)
+    }
+
+    /// Returns the length of the list of all tiles' places.
+    pub(crate) fn watched(&self) -> usize {
+        self.around.len()
+    }
+
+    /// Stores where the points around a tile are.
+    pub(crate) fn remember<T: Real>(&self, layout: &Layout, tile: usize, u: &Field<T>, snapshots: &mut [T]) {
+        let (places, first) = self.around(tile);
+        for c in 0..3 {
+            for (place, k) in places.iter().zip(0..) {
+                let at = c * layout.plane + layout.offset(*place as usize);
+                snapshots[3 * first + c * places.len() + k] = u[at];
+            }
+        }
+    }
+
+    /// Returns whether a point around a tile is more than `far` from where the tile remembers it.
+    pub(crate) fn has_moved<T: Real>(
+        &self,
+        layout: &Layout,
+        tile: usize,
+        u: &Field<T>,
+        snapshots: &[T],
+        far: T,
+    ) -> bool {
+        let (places, first) = self.around(tile);
+        (0..3).any(|c| {
+            let at = |place: &u32| c * layout.plane + layout.offset(*place as usize);
+            let then = &snapshots[3 * first + c * places.len()..][..places.len()];
+            let any = |any: bool, (place, then): (&u32, &T)| any | ((u[at(place)] - *then).magnitude() > far);
+            places.iter().zip(then).fold(false, any)
+        })
+    }
+}
+
+/// Returns the places of a tile.
+fn places_of([rows, columns]: [usize; 2], tile: usize) -> impl Iterator<Item = usize> {
+    let across = tiles(columns);
+    let range = |from: usize, end: usize| -> Range<usize> { from..(from + TILE).min(end) };
+    let (of_rows, of_columns) = (range(tile / across * TILE, rows), range(tile % across * TILE, columns));
+    of_rows.flat_map(move |row| of_columns.clone().map(move |column| row * columns + column))
+}

@@ -1,0 +1,402 @@
+//! The section `[solid]` of a scene: tissue with an inside, on a lattice of cubes that fills a closed surface, and its
+//! rest shape.
+//!
+//! A cube has the part of its stiffness and mass that is inside the surface, so that the surface may pass through cubes
+//! at any angle; the surface itself moves with the corners of the cube around each of its vertices (trilinear). The
+//! corners of the cubes are the mass points.
+
+use std::sync::Arc;
+
+use palpate_geometry::TriangleMesh;
+use palpate_geometry::fill::Lattice;
+
+use super::body::{BodyKind, KindOfBody, StiffnessBound};
+use super::material::{Inclusion, Region};
+use super::source::{Files, SourceMesh};
+use super::springs::Springs;
+use crate::limits::Limits;
+use crate::scene::action_check::physical;
+use crate::scene::toml_document::{Fields, Item};
+use crate::shape::{PointId, RestShape};
+use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
+
+mod fixed;
+mod shape;
+
+pub use fixed::FixedPart;
+pub use shape::SolidShape;
+
+use fixed::FixedParts;
+
+/// Smallest part of a cube that counts for stiffness and mass, if any of it is inside: a corner whose cubes were all
+/// slivers would have no mass.
+const LEAST_PART: f64 = 0.1;
+
+/// Largest Poisson's ratio. Towards ½ the number of substeps grows without bound.
+const MOST_POISSON: f64 = 0.495;
+
+/// Places along each side of a cube at which an inclusion's factor is looked up.
+const LOOKS: usize = 4;
+
+/// The material of a solid: elastic, of one density, damped in proportion to its mass.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SolidMaterial {
+    /// Young's modulus E, Pa.
+    pub youngs_modulus_pa: f64,
+    /// Poisson's ratio ν, 0 to 0.495.
+    pub poissons_ratio: f64,
+    /// Density ρ, kg/m³.
+    pub density_kg_per_m3: f64,
+    /// Damping: the force −c·m·v on a mass m, 1/s.
+    pub damping_per_s: f64,
+}
+
+impl SolidMaterial {
+    /// Message of the refusal of a coefficient beside the material ([`Reason::WrongKind`]).
+    pub const FOLLOWS: &str = "does not go with [solid], whose [material] gives it";
+
+    /// Returns a material of usual soft tissue, to start from: 8 kPa, ν 0.45, 1060 kg/m³, damping of 20/s.
+    pub fn usual() -> Self {
+        SolidMaterial { youngs_modulus_pa: 8e3, poissons_ratio: 0.45, density_kg_per_m3: 1060.0, damping_per_s: 20.0 }
+    }
+
+    pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
+        let usual = Self::usual();
+        let material = SolidMaterial {
+            youngs_modulus_pa: fields.required_number("youngs_modulus_pa")?,
+            poissons_ratio: fields.required_number("poissons_ratio")?,
+            density_kg_per_m3: fields.number("density_kg_per_m3")?.unwrap_or(usual.density_kg_per_m3),
+            damping_per_s: fields.number("damping_per_s")?.unwrap_or(usual.damping_per_s),
+        };
+        material.check()?;
+        Ok(material)
+    }
+
+    fn check(&self) -> Result<()> {
+        for (field, value) in [
+            ("material.youngs_modulus_pa", self.youngs_modulus_pa),
+            ("material.density_kg_per_m3", self.density_kg_per_m3),
+        ] {
+            physical(field, positive(field, value)?)?;
+        }
+        let holds = |v| (0.0..=MOST_POISSON).contains(&v);
+        number("material.poissons_ratio", self.poissons_ratio, "from 0 to 0.495", holds)?;
+        not_negative("material.damping_per_s", self.damping_per_s)?;
+        Ok(())
+    }
+
+    /// Returns Lamé's μ divided by E.
+    pub fn shear_over_youngs(&self) -> f64 {
+        0.5 / (1.0 + self.poissons_ratio)
+    }
+
+    /// Returns Lamé's λ divided by E.
+    pub fn lame_over_youngs(&self) -> f64 {
+        let nu = self.poissons_ratio;
+        nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    }
+}
+
+/// A solid tissue: its shape, its material, and how stiff each cube is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Solid {
+    /// The lattice, its points, and the surface within it.
+    pub shape: Arc<SolidShape>,
+    /// The material outside of inclusions.
+    pub material: SolidMaterial,
+    /// The part of each cube that counts, times its factor of E ([`Lattice::index`]); 0 for a cube outside.
+    weights: Arc<[f64]>,
+    /// Mass of each point divided by the mass of a full cube.
+    masses: Arc<[f64]>,
+    largest_factor: f64,
+}
+
+impl Solid {
+    /// Message of the refusal of a section that only surfaces have ([`Reason::WrongKind`]).
+    pub const HAS_AN_INSIDE: &str = "is for a mesh: a solid has an inside";
+
+    /// Creates a solid that fills the surface of a mesh (m), without inclusions.
+    ///
+    /// # Errors
+    /// Refuses what [`SolidShape::of`] refuses, with fields that begin with `solid`.
+    pub fn of(mesh: TriangleMesh, size: CellSize, fixed: &[FixedPart], material: SolidMaterial) -> Result<Self> {
+        let shape = SolidShape::of(mesh, size, fixed, &Limits::default());
+        let named = |refusal: Refusal| match refusal.field.as_str() {
+            "" => Refusal { field: "solid.mesh_id".to_owned(), ..refusal },
+            "cell_m" => Refusal { field: "solid.cell_m".to_owned(), ..refusal },
+            _ => refusal,
+        };
+        Ok(Solid::new(Arc::new(shape.map_err(named)?), material))
+    }
+
+    /// Creates a solid of a material without inclusions.
+    pub fn new(shape: Arc<SolidShape>, material: SolidMaterial) -> Self {
+        let counted = |part: &f32| if *part > 0.0 { f64::from(*part).max(LEAST_PART) } else { 0.0 };
+        let parts: Vec<f64> = shape.parts().iter().map(counted).collect();
+        let masses = shape.at_points(&parts).into();
+        Solid { shape, material, weights: parts.into(), masses, largest_factor: 1.0 }
+    }
+
+    /// Returns the solid with inclusions, in place of those that it had. A cube's factor is the geometric mean over it,
+    /// so that a sharp lump is as stiff as its size says. (A lump of 10 mm across and five times as stiff, 10 mm deep in
+    /// cubes of 2.5 to 5 mm: within 2 % of the truth; the arithmetic mean is 6 % too stiff.)
+    ///
+    /// # Errors
+    /// Refuses a group, a factor beyond 0.01 to 100, and a ball that reaches no cube; `field` is the key of the list.
+    pub(super) fn with_inclusions(&self, inclusions: &[Inclusion], field: &str) -> Result<Self> {
+        let mut solid = Solid::new(self.shape.clone(), self.material);
+        let mut weights = solid.weights.to_vec();
+        let mut factors = vec![1.0_f64; weights.len()];
+        for (number_of, inclusion) in inclusions.iter().enumerate() {
+            let field = format!("{field}[{number_of}]");
+            let Region::Ball { centre_m, radius_m } = inclusion.region else {
+                let message = "is for a mesh: an inclusion of a solid is a ball, with centre_m and radius_m";
+                return Err(Refusal::new(Reason::WrongKind, format!("{field}.group"), message));
+            };
+            let named = |key: &str| format!("{field}.{key}");
+            palpate_refusal::finite_vector(&named("centre_m"), centre_m)?;
+            positive(&named("radius_m"), radius_m)?;
+            not_negative(&named("edge_m"), inclusion.edge_m)?;
+            number(&named("stiffness_factor"), inclusion.stiffness_factor, "from 0.01 to 100", |v| {
+                (0.01..=100.0).contains(&v)
+            })?;
+            let reached = self.shape.cells_within(centre_m, radius_m + inclusion.edge_m);
+            let mut reaches = false;
+            for cell in reached {
+                let at = self.shape.lattice().index(cell);
+                if weights[at] > 0.0 {
+                    let part = inclusion.mean_part(self.shape.lattice(), cell, LOOKS);
+                    factors[at] *= libm::pow(inclusion.stiffness_factor, part);
+                    reaches |= part > 0.0;
+                }
+            }
+            if !reaches {
+                let message = "reaches no part of the solid";
+                return Err(Refusal::new(Reason::OutOfRange, named("radius_m"), message));
+            }
+        }
+        weights.iter_mut().zip(&factors).for_each(|(weight, factor)| *weight *= factor);
+        let stiffest = |(factor, weight): (&f64, &f64)| (*weight > 0.0).then_some(*factor);
+        solid.largest_factor = factors.iter().zip(&weights).filter_map(stiffest).fold(0.0, f64::max);
+        solid.weights = weights.into();
+        Ok(solid)
+    }
+
+    /// Returns the part of each cube that counts, times its factor of E, by [`Lattice::index`]; 0 for a cube outside.
+    pub fn weights(&self) -> &[f64] {
+        &self.weights
+    }
+
+    /// Returns the scale of stiffness, N/m, that stands for k of springs: E times the edge of a cube.
+    pub(super) fn stiffness_n_per_m(&self) -> f64 {
+        self.material.youngs_modulus_pa * self.shape.lattice().edge_m
+    }
+
+    /// Returns C of a point with the mass of a full cube, N·s/m.
+    pub(super) fn damping_n_s_per_m(&self) -> f64 {
+        self.material.damping_per_s * self.point_mass_kg()
+    }
+
+    /// Returns the bound of the largest eigenvalue of the stiffness, divided by E·a. With the mass of a full cube m = ρ·a³
+    /// no vibration at rest is faster than ω² = 4·f·(3λ + 2μ)/(ρ·a²), for any part of each cube, because mass and
+    /// stiffness have the same weight; f is the largest factor of E. So m·ω²/(E·a) = 4·f·(3λ + 2μ)/E.
+    fn bound(&self) -> f64 {
+        4.0 * self.largest_factor * (3.0 * self.material.lame_over_youngs() + 2.0 * self.material.shear_over_youngs())
+    }
+
+    /// Reads the mesh, the size of the cubes and the fixed parts.
+    fn read_shape(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<SolidShape> {
+        let (source_mesh, source) = files.mesh(fields, limits)?;
+        let (SourceMesh::Made(mesh) | SourceMesh::Read(mesh)) = source_mesh;
+        let (cell, cells) = (fields.item("cell_m"), fields.item("cells"));
+        let size = match (&cell, &cells) {
+            (Some(_), Some(cells)) => {
+                return Err(cells.refuse(Reason::WrongKind, "does not go with cell_m, from which it follows"));
+            }
+            (Some(cell), None) => CellSize::Edge(positive(&fields.path("cell_m"), cell.number()?)?),
+            (None, Some(cells)) => CellSize::Count(cells.whole()? as f64),
+            (None, None) => CellSize::USUAL,
+        };
+        let fixed = match fields.item("fixed") {
+            Some(item) => FixedParts::read(&item)?,
+            None => {
+                let message = "is missing: which part does not move, as [{ plane_m, normal, within_m }]";
+                return Err(fields.refuse(Reason::Missing, "fixed", message));
+            }
+        };
+        let made = SolidShape::of(mesh, size, &fixed.parts, limits);
+        made.map_err(|refusal| match refusal.field.as_str() {
+            "" => source.refuse(refusal.reason, refusal.message),
+            "cell_m" => cell.as_ref().or(cells.as_ref()).unwrap_or(&source).refuse(refusal.reason, refusal.message),
+            _ => refusal,
+        })
+    }
+}
+
+/// How large the cubes of a solid are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CellSize {
+    /// Edges of this length, m.
+    Edge(f64),
+    /// About this many cubes.
+    Count(f64),
+}
+
+impl CellSize {
+    /// That of a scene that gives neither the size of cubes nor their number.
+    pub const USUAL: Self = CellSize::Count(20_000.0);
+}
+
+impl KindOfBody for Solid {
+    const SECTION: &'static str = "solid";
+
+    /// The material is read afterwards.
+    fn read(fields: &mut Fields<'_>, files: Files<'_>, _of_material: bool, limits: &Limits) -> Result<Self> {
+        let shape = Self::read_shape(fields, files, limits)?;
+        Ok(Solid::new(Arc::new(shape), SolidMaterial::usual()))
+    }
+
+    fn read_springs(&mut self, fields: &mut Fields<'_>) -> Result<Springs> {
+        Err(fields.refuse(Reason::WrongKind, "", SolidMaterial::FOLLOWS))
+    }
+
+    /// A block of full cubes of the stiffest material, held below.
+    fn part(&self, side: usize) -> (Self, [PointId; 3]) {
+        let mut cells = 1;
+        while (cells + 2_usize).pow(3) <= side * side {
+            cells += 1;
+        }
+        let shape = SolidShape::block(cells, self.shape.lattice().edge_m);
+        let mut part = Solid::new(Arc::new(shape), self.material);
+        part.largest_factor = self.largest_factor;
+        part.weights = part.weights.iter().map(|weight| weight * self.largest_factor).collect();
+        let middle = cells / 2;
+        let points = [[middle, middle, cells], [cells, middle, middle], [0, 0, cells]];
+        let looked_at = points.map(|node| part.shape.point_at(node).unwrap_or_else(|| PointId::new(0)));
+        (part, looked_at)
+    }
+}
+
+impl BodyKind for Solid {
+    fn section(&self) -> &'static str {
+        Self::SECTION
+    }
+
+    fn points_key(&self) -> &'static str {
+        "solid.cell_m"
+    }
+
+    fn unit_hint(&self) -> &'static str {
+        "solid.unit says which unit its file is in"
+    }
+
+    fn shape(&self) -> &dyn RestShape {
+        &*self.shape
+    }
+
+    fn shared_shape(&self) -> Arc<dyn RestShape> {
+        self.shape.clone()
+    }
+
+    /// Returns the mass of a full cube, kg.
+    fn point_mass_kg(&self) -> f64 {
+        self.material.density_kg_per_m3 * self.shape.lattice().edge_m.powi(3)
+    }
+
+    fn mass_kg(&self) -> f64 {
+        self.point_mass_kg() * self.masses.iter().sum::<f64>()
+    }
+
+    fn relative_mass(&self, point: PointId) -> f64 {
+        self.masses.get(point.index()).copied().unwrap_or(1.0)
+    }
+
+    /// Returns the relative mass: K″/m is the same at every point.
+    fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
+        self.relative_mass(point)
+    }
+
+    fn mesh(&self) -> Option<TriangleMesh> {
+        Some(self.shape.source().clone())
+    }
+
+    fn identify(&self, _order: &[u32], add: &mut dyn FnMut(&[u8])) {
+        add(b"solid");
+        let Lattice { origin_m, edge_m, cells } = *self.shape.lattice();
+        for number in origin_m.to_array().into_iter().chain([edge_m, self.material.poissons_ratio]) {
+            add(&number.to_bits().to_le_bytes());
+        }
+        cells.iter().for_each(|count| add(&(*count as u64).to_le_bytes()));
+        self.weights.iter().for_each(|weight| add(&weight.to_bits().to_le_bytes()));
+        for point in crate::shape::points(&*self.shape) {
+            add(&[u8::from(self.shape.is_fixed(point))]);
+        }
+        for vertex_m in self.shape.surface().vertices_m() {
+            vertex_m.to_array().iter().for_each(|value| add(&value.to_bits().to_le_bytes()));
+        }
+        self.shape.surface().triangles().iter().flatten().for_each(|corner| add(&corner.to_le_bytes()));
+    }
+
+    fn spring_bound_n_per_m(&self, springs: &Springs, _anchor_n_per_m: f64) -> f64 {
+        springs.stiffness_n_per_m * self.bound()
+    }
+
+    fn fastest(&self) -> Option<StiffnessBound> {
+        None
+    }
+
+    fn warnings(&self) -> Vec<String> {
+        self.shape.findings().to_vec()
+    }
+
+    fn relative_cost(&self) -> f64 {
+        3.0
+    }
+
+    fn rehearsal_margin(&self) -> f64 {
+        2.0
+    }
+
+    fn table_bytes(&self) -> u64 {
+        const OF_A_CELL: usize = 48;
+        const OF_A_VERTEX: usize = 400;
+        (OF_A_CELL * self.weights.len() + OF_A_VERTEX * self.shape.surface().vertices_m().len()) as u64
+    }
+
+    fn check(&self, limits: &Limits) -> Result<()> {
+        let count = self.shape.place_count();
+        if count > limits.points {
+            let message = format!("gives {count} points, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, self.points_key(), message));
+        }
+        physical("solid.cell_m", self.shape.lattice().edge_m)?;
+        self.material.check()
+    }
+}
+
+impl Inclusion {
+    /// Returns how much of a cube is inside a ball, 0 to 1: the mean of [`Inclusion`]'s p at `looks`³ places.
+    fn mean_part(&self, lattice: &Lattice, cell: [usize; 3], looks: usize) -> f64 {
+        let Region::Ball { centre_m, radius_m } = &self.region else { return 0.0 };
+        let step_m = lattice.edge_m / looks as f64;
+        let first_m = lattice.middle_m(cell) - 0.5 * (lattice.edge_m - step_m);
+        let mut sum = 0.0;
+        for look in 0..looks.pow(3) {
+            let at = [look % looks, look / looks % looks, look / looks / looks].map(|at| at as f64);
+            let beyond_m = (first_m + step_m * glam::DVec3::from_array(at)).distance(*centre_m) - radius_m;
+            sum += self.part_beyond(beyond_m);
+        }
+        sum / looks.pow(3) as f64
+    }
+}
+
+/// Reads the material of a solid, and refuses the sections that it replaces.
+pub(super) fn read_material(fields: &mut Fields<'_>, solid: &Solid, material: Option<&Item<'_>>) -> Result<Solid> {
+    for section in ["springs", "anchor_springs", "damping"] {
+        if let Some(other) = fields.item(section) {
+            return Err(other.refuse(Reason::WrongKind, SolidMaterial::FOLLOWS));
+        }
+    }
+    let Some(material) = material else { return Err(fields.refuse(Reason::Missing, "material", "is missing")) };
+    Ok(Solid::new(solid.shape.clone(), material.table(SolidMaterial::read)?))
+}
