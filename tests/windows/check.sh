@@ -69,7 +69,8 @@ stop() {
     wait "$server" 2>/dev/null || true
     server=''
 }
-serve windows "$exe/palpate.exe"
+# Not by the function: the signal of `stop` must reach the server.
+serve sh tests/windows/wine.sh "$exe/palpate.exe"
 "$built/palpate-client" replay press --server "$url" --scene liver --output "$work/one.jsonl" --quiet
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/both.jsonl" --quiet
 for example in look touch; do
