@@ -37,7 +37,7 @@ help:
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): operations and plans under qemu-user; prints what it needs'
 	@echo 'make build-windows   programs, libpalpate and the module for Python for Windows, for its packages (25 min the first time)'
-	@echo 'make test-windows    builds for Windows (25 min the first time), and compares its results under Wine with those of Linux (30 s)'
+	@echo 'make test-windows    builds for Windows (25 min the first time), compares its results under Wine with those of Linux, and runs its service (2 min)'
 	@echo 'make check-macos     compiles the crates for macOS, without linking'
 	@echo 'make test-asan       the kernel under the address sanitizer'
 	@echo 'make test-valgrind   the kernel under memcheck of valgrind, plain and AVX2'
@@ -259,6 +259,7 @@ build-windows: need-rust
 
 test-windows: need-windows build
 	BUILT=$(BUILT) sh tests/windows/check.sh
+	BUILT=$(BUILT) sh tests/windows/service.sh
 
 # Compiles for macOS, without linking.
 check-macos: need-cross

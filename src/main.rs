@@ -5,6 +5,8 @@ mod program;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+#[cfg(windows)]
+use program::service;
 use program::{
     Failure, certificate, check, client, journal, mesh, organ, render, run, say, serve, texture, token, within_memory,
 };
@@ -107,6 +109,18 @@ enum ServerCommand {
         effect at once for new connections and calls. Invalid files are logged and the old ones stay in use; for \
         tokens, the health service `palpate.tokens` reports it.")]
     Serve(Box<serve::ServeArguments>),
+    /// Run the server as a service of Windows, which starts with the system: install it, remove it
+    #[cfg(windows)]
+    #[command(after_help = "Examples:\n  \
+        palpate service install --folder C:\\palpate -- --config palpate.toml\n  \
+        sc.exe start palpate\n  \
+        sc.exe query palpate\n  \
+        sc.exe stop palpate\n  \
+        palpate service remove\n\n\
+        `sc.exe stop` and the end of Windows end the server as Ctrl-C does. The log is in palpate.log, in the folder; \
+        the reason why a server did not start is there too. After a crash Windows starts the service again.\n\n\
+        Exit status: 0; 1 when the service control manager refused; 2 when an input was refused.")]
+    Service(service::ServiceArguments),
     /// Work with the journals that `palpate serve --journal DIR` writes: list, show, verify, replay, draw, export,
     /// cut and recover them
     #[command(after_help = "Examples:\n  \
@@ -175,6 +189,8 @@ fn main() -> ExitCode {
         ServerCommand::Mesh(arguments) => within_memory(|| mesh::mesh(&arguments)),
         ServerCommand::Organ(arguments) => within_memory(|| organ::organ(&arguments)),
         ServerCommand::Serve(arguments) => serve::serve(&arguments),
+        #[cfg(windows)]
+        ServerCommand::Service(arguments) => service::service(arguments),
         ServerCommand::Journal(arguments) => within_memory(|| journal::journal(&arguments)),
         ServerCommand::Token(arguments) => token::token(&arguments),
         ServerCommand::Certificate(arguments) => certificate::certificate(&arguments),

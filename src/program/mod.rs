@@ -11,6 +11,8 @@ pub(crate) mod render;
 pub(crate) mod run;
 mod scene;
 pub(crate) mod serve;
+#[cfg(windows)]
+pub(crate) mod service;
 pub(crate) mod texture;
 pub(crate) mod token;
 

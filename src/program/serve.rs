@@ -137,8 +137,30 @@ fn has_page(folder: &Path) -> bool {
     files.any(|file| file.path().extension().is_some_and(|extension| extension == "html"))
 }
 
+/// What a server runs in: a terminal, or the service control manager of Windows.
+pub(crate) struct ServerHost {
+    /// Ends the server when it is cancelled, as a signal does.
+    pub(crate) shutdown: CancellationToken,
+    /// Where the log goes, and whether it has colours.
+    pub(crate) log: Box<dyn Write + Send>,
+    pub(crate) has_colours: bool,
+    /// Called when the server serves.
+    pub(crate) ready: Box<dyn FnOnce()>,
+}
+
 /// Serves until a signal stops it.
 pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
+    let host = ServerHost {
+        shutdown: CancellationToken::new(),
+        log: Box::new(std::io::stderr()),
+        has_colours: std::io::stderr().is_terminal(),
+        ready: Box::new(|| {}),
+    };
+    serve_in(arguments, host)
+}
+
+/// Serves until a signal or the host stops it.
+pub(crate) fn serve_in(arguments: &ServeArguments, host: ServerHost) -> Result<(), Failure> {
     let mut config = load_config(arguments.config.as_deref())?;
     if let Some(listen) = &arguments.listen {
         config.listen.clone_from(listen);
@@ -235,11 +257,11 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let detailed = Filter::<Registry>::max_level_hint(&filter).is_none_or(|level| level >= tracing::Level::DEBUG);
     budget::set_up_allocator();
     // Logging never blocks: lines that do not fit into the queue are dropped.
-    let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
+    let (writer, _flush) = tracing_appender::non_blocking(host.log);
     let log = tracing_subscriber::fmt::layer()
         // At level debug, the duration of each call and sampled step is logged when it ends.
         .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
-        .with_ansi(std::io::stderr().is_terminal());
+        .with_ansi(host.has_colours);
     let log = if arguments.log_json {
         log.json().with_writer(move || log::JsonRecords(writer.clone())).boxed()
     } else {
@@ -264,7 +286,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
     let ended = runtime.block_on(async {
         let listeners = Listeners::open(&config).await?;
-        let shutdown = CancellationToken::new();
+        let shutdown = host.shutdown;
         signals::outlive();
         signals::cancel_on(shutdown.clone());
         let (url, metrics) = (listeners.url(), listeners.metrics_url());
@@ -274,6 +296,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
             if let Some(url) = metrics {
                 let _ = writeln!(std::io::stdout(), "metrics are at {url}");
             }
+            (host.ready)();
         });
         Ok(server::serve(listeners, config, shutdown, ready).await?)
     });

@@ -18,9 +18,12 @@ pub fn outlive() {
     }
 }
 
-/// Cancels `shutdown` on Ctrl-C or SIGTERM; a second one ends the process at once, with code 130. Both are caught
-/// when this returns, so a program may send one as soon as the server reports that it listens; if they can't be
-/// caught, this does nothing. On systems other than Unix, only Ctrl-C counts. Call it within a Tokio runtime.
+/// Cancels `shutdown` on Ctrl-C or SIGTERM, and on Windows on Ctrl-C, Ctrl-Break, and when the console closes or the
+/// system shuts down. A second one ends the process at once, with code 130. All are caught when this returns, so a
+/// program may send one as soon as the server reports that it listens; if they can't be caught, this does nothing. On
+/// other systems, only Ctrl-C counts. Call it within a Tokio runtime.
+///
+/// Windows ends a process a few seconds after its console has closed, whatever the deadline of the server is.
 pub fn cancel_on(shutdown: CancellationToken) {
     #[cfg(unix)]
     let (mut interrupt, mut terminate) = {
@@ -29,6 +32,13 @@ pub fn cancel_on(shutdown: CancellationToken) {
         let (Ok(interrupt), Ok(terminate)) = caught else { return };
         (interrupt, terminate)
     };
+    #[cfg(windows)]
+    let (mut interrupt, mut break_key, mut close, mut system) = {
+        use tokio::signal::windows::{ctrl_break, ctrl_c, ctrl_close, ctrl_shutdown};
+        let (Ok(interrupt), Ok(break_key)) = (ctrl_c(), ctrl_break()) else { return };
+        let (Ok(close), Ok(system)) = (ctrl_close(), ctrl_shutdown()) else { return };
+        (interrupt, break_key, close, system)
+    };
     tokio::spawn(async move {
         for signals in 0.. {
             #[cfg(unix)]
@@ -36,7 +46,14 @@ pub fn cancel_on(shutdown: CancellationToken) {
                 _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
             }
-            #[cfg(not(unix))]
+            #[cfg(windows)]
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = break_key.recv() => {}
+                _ = close.recv() => {}
+                _ = system.recv() => {}
+            }
+            #[cfg(not(any(unix, windows)))]
             let _ = tokio::signal::ctrl_c().await;
             if signals > 0 {
                 std::process::exit(130);

@@ -151,7 +151,10 @@ fn a_bridge_renders_from_a_copy_of_a_mesh_and_of_a_sheet_only_when_asked_to() {
     };
     let predicted = |output: &std::process::Output| {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        serde_json::from_slice::<Value>(&output.stdout).unwrap()["predicted_ticks"].as_u64().unwrap()
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let late_us = ["p50", "p99", "max"].map(|part| number(&report["tick_lateness_us"], part));
+        assert!(late_us[0] <= late_us[1] && late_us[1] <= late_us[2] && late_us[2] > 0.0, "{report}");
+        report["predicted_ticks"].as_u64().unwrap()
     };
     // On a busy machine, a connection or a copy may take more than a few seconds.
     for (scene, more) in [("paper", ""), ("gallbladder", "--prediction never")] {

@@ -2,7 +2,8 @@
 # Builds Palpate for Windows and runs it under Wine: `sh tests/windows/check.sh`, as `make test-windows` does.
 #
 # It compares the golden hashes of tests/determinism.rs, and the records of scripts, with those of Linux. It runs a server and its
-# clients, each under Wine and on Linux, and programs in C with libpalpate. It prints how often the loop of a device is late.
+# clients, each under Wine and on Linux, and programs in C with libpalpate. It prints how late the loop of a device and the server's
+# steps are, under Wine and on Linux.
 #
 # BUILT is the folder of the programs for this machine [default: target/release].
 set -eu
@@ -11,7 +12,8 @@ cd "$(dirname "$0")/../.."
 built=${BUILT:-target/release}
 target=x86_64-pc-windows-gnu
 out=${WINDOWS:-target/windows}
-export WINEPREFIX="$PWD/$out/wine"
+WINEPREFIX=$(realpath -m "$out/wine")
+export WINEPREFIX
 work=$(mktemp -d)
 server=''
 trap 'if [ -n "$server" ]; then kill "$server" 2>/dev/null; fi; rm -rf "$work"' EXIT
@@ -56,17 +58,19 @@ say 'seven runs of scripts: the same records as on Linux'
 
 serve() { # command of a server
     rm -f "$work/serving"
-    "$@" serve --listen 127.0.0.1:0 --log error > "$work/serving" &
+    "$@" serve --listen 127.0.0.1:0 --metrics 127.0.0.1:0 --log error > "$work/serving" &
     server=$!
-    until grep -qs http "$work/serving"; do sleep 0.2; kill -0 "$server"; done
+    until grep -qs metrics "$work/serving"; do sleep 0.2; kill -0 "$server"; done
     url=$(grep -o 'http[^[:space:]]*' "$work/serving" | head -1)
+    metrics=$(grep -o 'http[^[:space:]]*' "$work/serving" | tail -1)
 }
 stop() {
     kill "$server"
     wait "$server" 2>/dev/null || true
     server=''
 }
-serve windows "$exe/palpate.exe"
+# Not by the function: the signal of `stop` must reach the server.
+serve sh tests/windows/wine.sh "$exe/palpate.exe"
 "$built/palpate-client" replay press --server "$url" --scene liver --output "$work/one.jsonl" --quiet
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/both.jsonl" --quiet
 for example in look touch; do
@@ -77,12 +81,15 @@ cp "$exe/palpate_c.dll" "$work"
 windows "$work/look.exe" "$url" liver 1
 windows "$work/touch.exe" "$url" liver 2
 say 'libpalpate.dll: the examples look and touch run'
-windows "$exe/palpate-client.exe" bridge --server "$url" --scene liver --seconds 5 --json > "$work/bridge.json"
-say "a device at 1 kHz for 5 s, client and server under Wine: $(grep -oE '"(late|missed)_ticks":[0-9]+' "$work/bridge.json" | xargs)"
+late_of() { # command of a client
+    python3 tests/windows/lateness.py "$metrics" "$@" bridge --server "$url" --scene liver --seconds 10 --json
+}
+late=$(late_of sh tests/windows/wine.sh "$exe/palpate-client.exe")
+say "a device at 1 kHz for 10 s, client and server under Wine: $late"
 stop
 serve "$built/palpate"
-"$built/palpate-client" bridge --server "$url" --scene liver --seconds 5 --json > "$work/bridge.json"
-say "the same on this machine: $(grep -oE '"(late|missed)_ticks":[0-9]+' "$work/bridge.json" | xargs)"
+late=$(late_of "$built/palpate-client")
+say "the same on this machine: $late"
 windows "$exe/palpate-client.exe" replay press --server "$url" --scene liver --output "$work/other.jsonl" --quiet
 "$built/palpate-client" replay press --server "$url" --scene liver --output "$work/own.jsonl" --quiet
 stop

@@ -147,10 +147,12 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
 /// The results for programs.
 fn as_json(served: &BridgeReport, session_id: Option<&str>) -> serde_json::Value {
     let traffic = served.traffic;
+    let [p50_us, p99_us, max_us] = served.tick_lateness_s.map(|late_s| 1e6 * late_s);
     let mut report = json!({
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
         "failed_attempts": traffic.failed, "poses": traffic.poses, "datagrams_up": traffic.carried.sent,
         "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
+        "tick_lateness_us": { "p50": p50_us, "p99": p99_us, "max": max_us },
         "predicted_ticks": served.predicted_ticks, "largest_force_n": served.most_force_n,
         "largest_displacement_m": traffic.deepest_m, "session_id": session_id,
     });
@@ -169,6 +171,7 @@ fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
     let Traffic { connections, samples, bytes, refused, failed, poses, carried, deepest_m } = served.traffic;
     #[allow(clippy::cast_precision_loss)]
     let kilobytes = bytes as f64 / 1e3;
+    let [p50_us, p99_us, max_us] = served.tick_lateness_s.map(|late_s| 1e6 * late_s);
     let mut rows = vec![
         ("connections", format!("{connections} (attempts that failed, and breaks: {failed})")),
         ("samples received", format!("{samples}, {} kB", table::rounded(kilobytes))),
@@ -179,6 +182,7 @@ fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
         ),
         ("commands refused", refused.to_string()),
         ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
+        ("lateness of ticks p50 / p99 / max", format!("{p50_us:.0} / {p99_us:.0} / {max_us:.0} µs")),
         ("largest force", table::with_unit(served.most_force_n, "N")),
         ("tissue moved at most", format!("{:.1} mm", 1e3 * deepest_m)),
         ("from a copy of the tissue", format!("{} ticks", served.predicted_ticks)),

@@ -31,6 +31,20 @@ pub fn parse<A: Parser>() -> A {
     }
 }
 
+/// Parses `arguments`, the first of which is the name of the program, as [`parse`] parses those of this process.
+///
+/// # Errors
+/// Returns the reason of a refusal, in one line.
+pub fn parse_from<A: Parser>(arguments: impl IntoIterator<Item = OsString>) -> Result<A, String> {
+    read(arguments).map_err(|error| {
+        number(&error).unwrap_or_else(|| {
+            let text = error.to_string();
+            let line = text.lines().next().unwrap_or_default();
+            line.strip_prefix("error: ").unwrap_or(line).to_owned()
+        })
+    })
+}
+
 fn read<A: Parser>(arguments: impl IntoIterator<Item = OsString>) -> Result<A, Error> {
     let mut command = with_negative_numbers(A::command());
     let matches = command.try_get_matches_from_mut(arguments.into_iter().map(without_exponent))?;
@@ -106,6 +120,15 @@ mod tests {
         assert_eq!(read_of(&["--edge-mm", "-2.5e-1", "--json"]).unwrap().edge_mm, Some(-0.25));
         assert_eq!(read_of(&["-3"]).unwrap().name.as_deref(), Some("-3"));
         assert!(read_of(&["--unit", "--json"]).is_err());
+    }
+
+    #[test]
+    fn a_refusal_is_one_line() {
+        let refused = |arguments: [&str; 2]| {
+            parse_from::<TestArguments>(["program"].into_iter().chain(arguments).map(OsString::from)).unwrap_err()
+        };
+        assert_eq!(refused(["--untit", "m"]), "unexpected argument '--untit' found");
+        assert_eq!(refused(["--threads", "two"]), "--threads: must be a whole number from 0, but is `two`");
     }
 
     #[test]

@@ -20,21 +20,32 @@ impl Count {
     }
 }
 
-/// Number of bounds of a histogram: 1 µs, 2 µs, 4 µs, … One more bucket has no bound.
-const BOUNDS: usize = 18;
+/// Number of bounds of a histogram: 1 µs, 1.5 µs, 2 µs, 3 µs, 4 µs, 6 µs, … One more bucket has no bound.
+const BOUNDS: usize = 35;
 
-/// Histogram of times, with 19 buckets: up to 1 µs, 2 µs, 4 µs and so on to 131 ms, and longer ones.
-#[derive(Debug, Default)]
+/// Histogram of times, with 36 buckets: up to 1 µs, 1.5 µs, 2 µs, 3 µs, 4 µs and so on to 131 ms, and longer ones. So
+/// its quantiles are known to within a half.
+#[derive(Debug)]
 pub struct Times {
     buckets: [Count; BOUNDS + 1],
     sum_ns: Count,
 }
 
+impl Default for Times {
+    fn default() -> Self {
+        Times { buckets: std::array::from_fn(|_| Count::default()), sum_ns: Count::default() }
+    }
+}
+
 impl Times {
     pub(super) fn add(&self, ns: u64) {
         // A bound belongs to the bucket below it.
-        let whole_us = ns.saturating_sub(1) / 1000;
-        let bucket = (u64::BITS - whole_us.leading_zeros()) as usize;
+        let halves_us = ns.saturating_sub(1) / 500;
+        let bucket = match halves_us.checked_ilog2() {
+            None | Some(0) => 0,
+            // The two buckets of an octave differ in the second bit.
+            Some(octave) => 2 * octave as usize - 1 + usize::from(halves_us >> (octave - 1) & 1 == 1),
+        };
         self.buckets[bucket.min(BOUNDS)].add(1);
         self.sum_ns.add(ns);
     }
@@ -43,7 +54,11 @@ impl Times {
     /// counts below it. The bound of the last is infinite.
     #[allow(clippy::cast_precision_loss)]
     pub fn buckets(&self) -> Vec<(f64, u64)> {
-        let bound_s = |bucket: usize| if bucket < BOUNDS { (1_u64 << bucket) as f64 * 1e-6 } else { f64::INFINITY };
+        let bound_s = |bucket: usize| match bucket {
+            BOUNDS.. => f64::INFINITY,
+            _ if bucket.is_multiple_of(2) => (1_u64 << (bucket / 2)) as f64 * 1e-6,
+            _ => (3_u64 << (bucket / 2)) as f64 * 0.5e-6,
+        };
         self.buckets.iter().enumerate().map(|(bucket, count)| (bound_s(bucket), count.get())).collect()
     }
 
@@ -92,11 +107,30 @@ mod tests {
 
     #[test]
     fn a_time_is_in_the_bucket_whose_bound_it_does_not_pass() {
-        for (ns, bucket) in [(0, 0), (1000, 0), (1001, 1), (2000, 1), (2001, 2), (131_072_000, 17), (u64::MAX, 18)] {
+        for (ns, bound_us) in [
+            (0, 1.0),
+            (1000, 1.0),
+            (1001, 1.5),
+            (1500, 1.5),
+            (1501, 2.0),
+            (2000, 2.0),
+            (2001, 3.0),
+            (3001, 4.0),
+            (4001, 6.0),
+            (6001, 8.0),
+            (100_000, 128.0),
+            (98_304_000, 98_304.0),
+            (131_072_000, 131_072.0),
+            (131_072_001, f64::INFINITY),
+            (u64::MAX, f64::INFINITY),
+        ] {
             let times = Times::default();
             times.add(ns);
-            let counts: Vec<u64> = times.buckets().iter().map(|bucket| bucket.1).collect();
-            assert_eq!(counts.iter().position(|count| *count == 1), Some(bucket), "{ns} ns");
+            let counted: Vec<f64> =
+                times.buckets().iter().filter(|bucket| bucket.1 == 1).map(|bucket| bucket.0).collect();
+            assert_eq!(counted, [bound_us * 1e-6], "{ns} ns");
         }
+        let bounds: Vec<f64> = Times::default().buckets().iter().map(|bucket| bucket.0).collect();
+        assert!(bounds.is_sorted_by(|one, next| one < next), "{bounds:?}");
     }
 }

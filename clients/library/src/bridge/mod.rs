@@ -8,6 +8,7 @@
 
 mod copy_fetch;
 mod copy_thread;
+mod lateness;
 mod line;
 mod offline;
 mod tick;
@@ -159,6 +160,9 @@ pub struct BridgeReport {
     pub late_ticks: u64,
     /// Number of ticks that were skipped, because the loop was more than 5 ms late.
     pub missed_ticks: u64,
+    /// Time by which ticks began after they were due, s: median, 99th percentile and longest, the first two rounded up
+    /// to whole microseconds; skipped ticks don't count. Zeros without a tick.
+    pub tick_lateness_s: [f64; 3],
     /// Number of ticks that were rendered from a copy of the tissue.
     pub predicted_ticks: u64,
     /// The largest magnitude of a rendered force, N.
@@ -250,8 +254,17 @@ pub async fn run_told<D: HapticDevice + 'static>(
         ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
     let made = line.shared.inbound().made.clone();
     line.close().await;
-    let tick::Served { course, envelope, late_ticks, missed_ticks, predicted_ticks, most_force_n, ages_s, failure } =
-        served;
+    let tick::Served {
+        course,
+        envelope,
+        late_ticks,
+        missed_ticks,
+        lateness,
+        predicted_ticks,
+        most_force_n,
+        ages_s,
+        failure,
+    } = served;
     let failure = failure.map(Error::Device);
     let mut inbound = line.shared.inbound();
     let (traffic, lost) = (inbound.traffic, inbound.failure.take());
@@ -264,6 +277,7 @@ pub async fn run_told<D: HapticDevice + 'static>(
         envelope,
         late_ticks,
         missed_ticks,
+        tick_lateness_s: lateness.quantiles_s(),
         predicted_ticks,
         most_force_n,
         priority,

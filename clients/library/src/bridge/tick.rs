@@ -7,6 +7,7 @@ use palpate_haptics::{Envelope, RenderingState};
 use tokio::sync::Notify;
 
 use super::Disable;
+use super::lateness::TickLateness;
 use super::ticker::Ticker;
 use crate::device::HapticDevice;
 
@@ -43,6 +44,8 @@ pub(super) struct Served {
     pub(super) late_ticks: u64,
     /// Number of ticks that were skipped.
     pub(super) missed_ticks: u64,
+    /// How late the ticks began that were not skipped.
+    pub(super) lateness: TickLateness,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub(super) predicted_ticks: u64,
     /// The largest rendered force, N.
@@ -86,7 +89,7 @@ fn tick(
     remember: bool,
     served: &mut Served,
 ) -> std::io::Result<()> {
-    let Served { course, late_ticks, missed_ticks, ages_s, most_force_n, .. } = served;
+    let Served { course, late_ticks, missed_ticks, lateness, ages_s, most_force_n, .. } = served;
     let start = Instant::now();
     let mut due = start;
     // If a tick is much too late, later ones are timed from it.
@@ -103,7 +106,9 @@ fn tick(
     };
     while lasts.is_none_or(|lasts| due.duration_since(start) < lasts) && !ticker.is_over() {
         wait_until(due);
-        *late_ticks += u64::from(catch_up(&mut due).1.as_secs_f64() > TICK_S);
+        let late = catch_up(&mut due).1;
+        *late_ticks += u64::from(late.as_secs_f64() > TICK_S);
+        lateness.add(late);
         let reading = device.read()?;
         // The device may have waited for its next position. The time of the force is what counts: a late tick must
         // not be made up for by a step at the next one.
