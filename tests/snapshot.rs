@@ -28,6 +28,9 @@ fn limits() -> Limits {
 const GALLBLADDER: &str = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
                            thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n";
 
+const SOLID: &str = "[solid]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\ncell_m = 0.007\n\
+                     fixed = [{ group = \"neck\" }]\n[material]\nyoungs_modulus_pa = 2e4\npoissons_ratio = 0.4\n";
+
 /// Events of a session before a step.
 #[derive(Debug, Clone)]
 enum SessionEvent {
@@ -163,12 +166,13 @@ fn case(seed: u64) -> SnapshotCase {
         sets.push(format!("sleep.tolerance={:?}", [0.0, 1e-3, 1e-2, 5e-2][random.usize(0..4)]));
     }
     // To make an organ takes longer than to step it.
-    static ORGAN: OnceLock<Scene> = OnceLock::new();
-    let organ = || Scene::parse("organ", GALLBLADDER, &[], &limits()).unwrap();
+    static ORGANS: OnceLock<[Scene; 2]> = OnceLock::new();
+    let organs = || [GALLBLADDER, SOLID].map(|text| Scene::parse("organ", text, &[], &limits()).unwrap());
     let first = if on_mesh {
         let settings = Scene::parse("settings", PAPER, &sets, &limits()).unwrap();
         let (stepping, sleep_tolerance) = (settings.stepping, settings.sleep_tolerance);
-        Scene { stepping, sleep_tolerance, ..ORGAN.get_or_init(organ).clone() }
+        let organ = &ORGANS.get_or_init(organs)[usize::from(seed % 16 == 11)];
+        Scene { stepping, sleep_tolerance, ..organ.clone() }
     } else {
         Scene::parse("random", PAPER, &sets, &limits()).unwrap()
     };

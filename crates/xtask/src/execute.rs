@@ -57,6 +57,13 @@ pub(crate) fn execute(stages: &[PlanStage]) -> Result<(), TaskFailure> {
                 }
                 ended?;
             }
+            PlanStage::Together { step, others } => {
+                let others = others.clone();
+                let beside = std::thread::spawn(move || others.iter().try_for_each(run));
+                let ended = run(step);
+                let beside = beside.join().map_err(|_| TaskFailure::Failed("a thread has failed".to_owned())).flatten();
+                ended.and(beside)?;
+            }
             PlanStage::Mark(file) => {
                 std::fs::write(file, "")
                     .map_err(|error| TaskFailure::Failed(format!("can't write {file}: {error}")))?;

@@ -24,6 +24,8 @@ pub(crate) enum PlanStage {
     Step(Step),
     /// A command, and others at the same time that may fail. If one does, the rest of them do not run, and this text is printed.
     Beside { step: Step, others: Vec<Step>, without: &'static str },
+    /// A command, and others one after another at the same time. The plan ends when all have ended, if one fails.
+    Together { step: Step, others: Vec<Step> },
     /// Writes an empty file, which says that the stages before it are done.
     Mark(&'static str),
     /// Prints what is left out, and why.
@@ -140,22 +142,27 @@ impl System {
             self.need_python()?;
             stages.extend(self.venv());
         }
+        let mut others = Vec::new();
         for (_, part) in PARTS.into_iter().filter(|(_, part)| is_asked(*part)) {
             match part {
                 TestPart::Viewer => {
                     self.need_node()?;
-                    stages.extend(self.page().into_iter().map(PlanStage::Step));
-                    stages.extend(
-                        ["clients/viewer", "clients/typescript"].map(|of| PlanStage::Step(self.npm(of, &["test"]))),
-                    );
+                    others.extend(self.page());
+                    others.extend(["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"])));
                 }
                 // The tools for building are those of the environment, so that pip makes none of its own; what is compiled is
                 // what the first stage has compiled.
                 TestPart::Python => {
                     let install = ["--no-build-isolation", "--no-deps", "--force-reinstall", "./clients/python"];
-                    let install = Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) };
-                    stages.push(PlanStage::Step(install));
-                    stages.push(PlanStage::Step(self.unittest("clients/python/tests")));
+                    others.push(Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) });
+                    others.push(self.unittest("clients/python/tests"));
+                }
+                // The tests of Rust compile for minutes, which those before need not wait for. They run alone: some serve in
+                // real time.
+                TestPart::Rust if !others.is_empty() => {
+                    let compile = self.cargo(&["test", "--release", "--workspace", "--no-run"]);
+                    stages.push(PlanStage::Together { step: compile, others: std::mem::take(&mut others) });
+                    stages.push(self.rust_tests());
                 }
                 TestPart::Protocol => {
                     let format = Step { folder: "proto/generator", ..self.cargo(&["fmt", "--check"]) };
@@ -163,10 +170,7 @@ impl System {
                     let compare = Step { folder: "proto/generator", ..self.cargo(&generator) };
                     stages.extend([PlanStage::Step(format), PlanStage::Step(compare)]);
                 }
-                TestPart::Rust => {
-                    let test = self.cargo(&["test", "--release", "--workspace", "--no-fail-fast"]);
-                    stages.push(PlanStage::Step(Step { variable: Some(SEED), ..test }));
-                }
+                TestPart::Rust => stages.push(self.rust_tests()),
                 TestPart::Abi if self.has_shell && !self.is_windows => {
                     let built = format!("{}/release", self.target);
                     stages.push(PlanStage::Step(step("sh", &["tests/abi/check.sh", &built, "interface"])));
@@ -180,8 +184,17 @@ impl System {
                 }
                 TestPart::Documents => stages.push(PlanStage::Step(self.unittest("tests/python"))),
             }
+            // Without the tests of Rust, each runs alone.
+            if !is_asked(TestPart::Rust) {
+                stages.extend(others.drain(..).map(PlanStage::Step));
+            }
         }
         Ok(stages)
+    }
+
+    fn rust_tests(&self) -> PlanStage {
+        let test = self.cargo(&["test", "--release", "--workspace", "--no-fail-fast"]);
+        PlanStage::Step(Step { variable: Some(SEED), ..test })
     }
 
     fn pip(&self, arguments: &[&str]) -> Step {
@@ -226,6 +239,10 @@ pub(crate) fn shown(stages: &[PlanStage]) -> String {
             PlanStage::Beside { step, others, .. } => {
                 add(step.to_string());
                 others.iter().for_each(|other| add(format!("{other}   # at the same time; may fail")));
+            }
+            PlanStage::Together { step, others } => {
+                add(step.to_string());
+                others.iter().for_each(|other| add(format!("{other}   # at the same time")));
             }
             PlanStage::Mark(file) => add(format!("# marks {file}")),
             PlanStage::Note(text) => add(format!("# {text}")),
@@ -325,13 +342,14 @@ mod tests {
             unix,
             [
                 WORKSPACE,
-                "(in clients/viewer) npm test",
-                "(in clients/typescript) npm test",
-                "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
-                 --force-reinstall ./clients/python",
-                "target/venv/bin/python -m unittest discover -s clients/python/tests -v",
                 "(in proto/generator) cargo fmt --check",
                 "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator",
+                "cargo test --release --workspace --no-run",
+                "(in clients/viewer) npm test   # at the same time",
+                "(in clients/typescript) npm test   # at the same time",
+                "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
+                 --force-reinstall ./clients/python   # at the same time",
+                "target/venv/bin/python -m unittest discover -s clients/python/tests -v   # at the same time",
                 "PROPTEST_RNG_SEED=20261122 cargo test --release --workspace --no-fail-fast",
                 "sh tests/abi/check.sh target/release interface",
                 "target/venv/bin/python -m unittest discover -s tests/python -v",
@@ -346,6 +364,13 @@ mod tests {
                 "{windows}: {unix}"
             );
         }
+    }
+
+    #[test]
+    fn without_the_tests_of_rust_each_part_runs_alone() {
+        let lines = lines(&ProjectTask::Test(vec![TestPart::Viewer, TestPart::Python]), &built(false));
+        assert_eq!(lines.len(), 5, "{lines:?}");
+        assert!(lines.iter().all(|line| !line.contains("at the same time")), "{lines:?}");
     }
 
     #[test]

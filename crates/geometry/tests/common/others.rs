@@ -114,7 +114,7 @@ pub fn glb_with_textures() -> Vec<u8> {
 }
 
 /// A file of another solid.
-pub struct Solid {
+pub struct VolumeMesh {
     pub name: &'static str,
     pub text: String,
     /// Number of vertices in triangles, and of triangles.
@@ -125,8 +125,8 @@ pub struct Solid {
 }
 
 /// Solids whose faces have more than three corners.
-pub fn solids() -> Vec<Solid> {
-    let solid = |name, text: &str, counts, area_cm2, volume_ml| Solid {
+pub fn solids() -> Vec<VolumeMesh> {
+    let solid = |name, text: &str, counts, area_cm2, volume_ml| VolumeMesh {
         name,
         text: text.to_owned(),
         counts,

@@ -350,7 +350,7 @@ impl SceneToSend {
             of_scene.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
         }
         let upload = file.or_else(|| {
-            let (name, bytes, unit) = sent::file_of(scene)?;
+            let (name, bytes, unit) = sent::file(scene)?;
             Some(MeshToSend { name: name.to_owned(), bytes, unit: unit.to_owned() })
         });
         SceneToSend { message, upload }

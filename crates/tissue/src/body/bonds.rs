@@ -3,7 +3,23 @@
 use glam::{DMat3, DVec3};
 
 use crate::body::solid::linear::LinearCells;
-use crate::body::window::Spring;
+
+/// A spring of the part, linearised at the present displacements.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Spring {
+    pub(crate) ends: [usize; 2],
+    pub(crate) rest_m: DVec3,
+    pub(crate) stiffness_n_per_m: f64,
+    pub(crate) tangent: DMat3,
+    /// Force on the first end, N.
+    pub(crate) force_n: DVec3,
+}
+
+impl Spring {
+    pub(super) fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
+        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
+    }
+}
 
 /// What joins the points of a part of a tissue.
 #[derive(Debug)]

@@ -23,13 +23,11 @@ use glam::DVec3;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::Width;
 use crate::kernel::real::Real;
-use crate::kernel::region::sides_of;
 use crate::scene::graph::GraphFault;
 use crate::scene::profile::Poke;
 use crate::scene::{Body, Scene, Sheet};
 use crate::shape::{self, PointId};
 use disc::TissueDisc;
-use force_field::ForceChange;
 use sheet::falloff::SheetPoints;
 use sheet::footprint::GridDisc;
 use solid::SolidPlaces;
@@ -115,16 +113,6 @@ impl Places {
             Places::Sheet(_) => None,
             Places::Surface(places) => Some(&places.links),
             Places::Solid(places) => Some(&places.links),
-        }
-    }
-
-    /// Returns an upper bound of the change of force on any point of a tile, N; on a mesh divided by the smallest relative
-    /// K″ of the tile.
-    fn most_change_n(&self, change: &ForceChange, layout: &Layout, tile: usize) -> f64 {
-        match self {
-            Places::Sheet(_) => f64::INFINITY,
-            Places::Surface(places) => change.most_n(places.box_of(tile)) / places.least_pull(tile),
-            Places::Solid(places) => change.most_n(&places.box_of(&sides_of(layout, tile))),
         }
     }
 

@@ -10,7 +10,7 @@ use crate::body::force_field::ForceChange;
 use crate::body::model::Model;
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::real::Real;
-use crate::kernel::region::{Marks, tile_of};
+use crate::kernel::region::{Marks, sides_of, tile_of};
 
 /// The tiles of a tissue and what joins them.
 #[derive(Debug, Clone)]
@@ -167,9 +167,19 @@ impl TileGraph {
             TileGraph::Sheet(sheet) => sheet.force_changes(change, spacing_m, everywhere, awake, changed),
             TileGraph::Linked(places, layout) => {
                 for tile in (0..awake.len()).filter(|tile| !awake[*tile]) {
-                    changed(tile, places.most_change_n(change, layout, tile));
+                    changed(tile, most_change_n(places, change, layout, tile));
                 }
             }
         }
+    }
+}
+
+/// Returns an upper bound of the change of force on any point of a tile, N; on a mesh divided by the smallest relative K″ of
+/// the tile.
+fn most_change_n(places: &Places, change: &ForceChange, layout: &Layout, tile: usize) -> f64 {
+    match places {
+        Places::Sheet(_) => f64::INFINITY,
+        Places::Surface(places) => change.most_n(places.box_of(tile)) / places.least_pull(tile),
+        Places::Solid(places) => change.most_n(&places.box_of(&sides_of(layout, tile))),
     }
 }

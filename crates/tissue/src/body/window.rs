@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::body::Places;
-use crate::body::bonds::Bonds;
+use crate::body::bonds::{Bonds, Spring};
 use crate::body::footprint::Footprint;
 use crate::body::model::Model;
 use crate::body::solid::linear::LinearCells;
@@ -16,23 +16,6 @@ pub(crate) const REACHES: f64 = 6.0;
 /// bounded, and so is its memory: 20 MB for the 116² points that 2^27 springs times iterations allow.
 const BYTES_PER_POINT: usize =
     6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<[DVec3; 3]>() + 16;
-
-/// A spring of the part, linearised at the present displacements.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Spring {
-    pub(crate) ends: [usize; 2],
-    pub(crate) rest_m: DVec3,
-    pub(crate) stiffness_n_per_m: f64,
-    pub(crate) tangent: DMat3,
-    /// Force on the first end, N.
-    pub(crate) force_n: DVec3,
-}
-
-impl Spring {
-    fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
-        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
-    }
-}
 
 /// The points around a disc that notice it: those that a patch computes. Those beyond are held at rest.
 #[derive(Debug, Clone, PartialEq)]

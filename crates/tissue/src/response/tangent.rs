@@ -499,7 +499,8 @@ impl Press {
         // noticed, and each depth some solutions. A press that can't be completed is not begun, and takes no
         // memory.
         let (footprint, window) = Self::laid(model, &course);
-        let least = window.len() as u64 * 4 * u64::from(course.count) * (window.across() as u64);
+        let solved = if model.scene.body.kind().law_is_linear() { 1 } else { u64::from(course.count) };
+        let least = window.len() as u64 * 4 * solved * (window.across() as u64);
         (least <= work).then(|| Press { left: work, ..Self::begun(footprint, window, course, accuracy) })
     }
 
@@ -521,6 +522,11 @@ impl Press {
             return Deepened::GivenUp;
         }
         let Some(depth_m) = self.next_depth_m() else { return Deepened::Done };
+        if let Some(first) = self.pressed.first().filter(|_| model.scene.body.kind().law_is_linear()) {
+            let force_n = first.tangent.stiffness_n_per_m.z_axis.z * depth_m;
+            self.pressed.push(Pressed { depth_m, force_n, tangent: first.tangent });
+            return if self.next_depth_m().is_some() { Deepened::Further } else { Deepened::Done };
+        }
         let displacement_m = std::mem::take(&mut self.displacement_m);
         let patch = LinearPatch::turned(model, &self.footprint, self.window.clone(), displacement_m, &self.turn);
         let mut patch = LinearPatch { accuracy: self.accuracy, allowance: Allowance::of(self.left, stop), ..patch };

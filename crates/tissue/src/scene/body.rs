@@ -195,6 +195,12 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         None
     }
 
+    /// Returns whether the force law of a disc has the stiffness at rest at all depths, because a press to each depth would
+    /// take too long.
+    fn law_is_linear(&self) -> bool {
+        false
+    }
+
     /// Returns the thickness of the tissue under a point, m: the distance straight inward, against its normal, to
     /// another part of the surface. `None` if there is none.
     fn thickness_m(&self, _point: PointId) -> Option<f64> {

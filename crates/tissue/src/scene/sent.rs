@@ -2,11 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use palpate_geometry::TriangleMesh;
 use palpate_geometry::write::{Format, write};
 
+use super::Scene;
 use super::source::unit_text;
-use super::{Mesh, Scene};
 use crate::files;
 use crate::limits::Limits;
 use crate::scene::toml_document::{Document, Fields};
@@ -63,34 +62,11 @@ pub fn said(name: &str, text: &str) -> Result<Option<MeshFile>> {
     Ok(found)
 }
 
-/// Returns the mesh of a scene as its file has it, in m. If the simulated mesh has other vertices (it is
-/// coarser, or vertices were joined), it is the mesh of the file, with texture coordinates if the file has
-/// them; otherwise the simulated mesh, without texture coordinates, whose edges may have been flipped.
-pub fn written(mesh: &Mesh) -> TriangleMesh {
-    if let Some(shown) = mesh.shape.shown() {
-        return shown.mesh.clone();
-    }
-    TriangleMesh {
-        vertices_m: mesh.shape.vertices_m().to_vec(),
-        triangles: mesh.shape.triangles().to_vec(),
-        uv: None,
-        groups: mesh.shape.told().groups.clone(),
-    }
-}
-
-/// Returns the mesh of a scene as a file to send: its name `"mesh.obj"`, its bytes (OBJ, with groups), and its
-/// unit `"m"`. It is the mesh of [`written`]: that of the file, with texture coordinates, if the simulated mesh
-/// has other vertices; otherwise the simulated mesh, without them.
-pub fn file(mesh: &Mesh) -> (&'static str, Vec<u8>, &'static str) {
-    ("mesh.obj", write(&written(mesh), Format::Obj), "m")
-}
-
-/// Returns the mesh that belongs to a scene besides its text as a file to send, as [`file()`] does; `None` if the text
-/// describes the whole tissue.
-pub fn file_of(scene: &Scene) -> Option<(&'static str, Vec<u8>, &'static str)> {
-    if let Some(mesh) = scene.mesh() {
-        return Some(file(mesh));
-    }
+/// Returns the mesh that belongs to a scene besides its text ([`BodyKind::mesh`]) as a file to send: its name `"mesh.obj"`,
+/// its bytes (OBJ, with groups and texture coordinates), and its unit `"m"`. `None` if the text describes the whole tissue.
+///
+/// [`BodyKind::mesh`]: super::BodyKind::mesh
+pub fn file(scene: &Scene) -> Option<(&'static str, Vec<u8>, &'static str)> {
     Some(("mesh.obj", write(&scene.body.kind().mesh()?, Format::Obj), "m"))
 }
 

@@ -24,16 +24,16 @@ mod fixed;
 mod shape;
 
 pub use fixed::FixedPart;
-pub use shape::SolidShape;
+pub use shape::{CellSize, SolidShape};
 
 use fixed::FixedParts;
 
 /// Smallest part of a cube that counts for stiffness and mass, if any of it is inside: a corner whose cubes were all
 /// slivers would have no mass.
-const LEAST_PART: f64 = 0.1;
+const MIN_PART: f64 = 0.1;
 
 /// Largest Poisson's ratio. Towards ½ the number of substeps grows without bound.
-const MOST_POISSON: f64 = 0.495;
+const MAX_POISSON: f64 = 0.495;
 
 /// Places along each side of a cube at which an inclusion's factor is looked up.
 const LOOKS: usize = 4;
@@ -79,7 +79,7 @@ impl SolidMaterial {
         ] {
             physical(field, positive(field, value)?)?;
         }
-        let holds = |v| (0.0..=MOST_POISSON).contains(&v);
+        let holds = |v| (0.0..=MAX_POISSON).contains(&v);
         number("material.poissons_ratio", self.poissons_ratio, "from 0 to 0.495", holds)?;
         not_negative("material.damping_per_s", self.damping_per_s)?;
         Ok(())
@@ -131,7 +131,7 @@ impl Solid {
 
     /// Creates a solid of a material without inclusions.
     pub fn new(shape: Arc<SolidShape>, material: SolidMaterial) -> Self {
-        let counted = |part: &f32| if *part > 0.0 { f64::from(*part).max(LEAST_PART) } else { 0.0 };
+        let counted = |part: &f32| if *part > 0.0 { f64::from(*part).max(MIN_PART) } else { 0.0 };
         let parts: Vec<f64> = shape.parts().iter().map(counted).collect();
         let masses = shape.at_points(&parts).into();
         Solid { shape, material, weights: parts.into(), masses, largest_factor: 1.0 }
@@ -231,20 +231,6 @@ impl Solid {
             _ => refusal,
         })
     }
-}
-
-/// How large the cubes of a solid are.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum CellSize {
-    /// Edges of this length, m.
-    Edge(f64),
-    /// About this many cubes.
-    Count(f64),
-}
-
-impl CellSize {
-    /// That of a scene that gives neither the size of cubes nor their number.
-    pub const USUAL: Self = CellSize::Count(20_000.0);
 }
 
 impl KindOfBody for Solid {
@@ -349,12 +335,21 @@ impl BodyKind for Solid {
         self.shape.findings().to_vec()
     }
 
+    /// A depth of a solid takes as long as hundreds of steps, and an even pressure on a disc hardly stiffens it: a block of
+    /// 3 mm cubes gives way to 2 mm with 5 % less stiffness than to 0.02 mm.
+    fn law_is_linear(&self) -> bool {
+        true
+    }
+
+    /// Measured on one core with AVX2: 14 ns a point and substep, where a sheet takes 5.7.
     fn relative_cost(&self) -> f64 {
         3.0
     }
 
+    /// A rehearsal pushes single points of a small block, whose waves nothing damps soon. (Forces that jump, 2 to 10 mm
+    /// wide, on cubes of 3 and 5 mm: the true error is at most 0.11 times the rehearsed one.)
     fn rehearsal_margin(&self) -> f64 {
-        2.0
+        0.4
     }
 
     fn table_bytes(&self) -> u64 {

@@ -15,13 +15,23 @@ use crate::scene::SolidShape;
 use crate::shape::{CellPlace, PointId};
 use palpate_refusal::Result;
 
+/// The part of a vertex's weight and derivative that a point gets.
+#[derive(Debug, Clone, Copy)]
+struct CoveredPart {
+    point: u32,
+    /// In which order the parts were found, and are added.
+    order: u32,
+    weight: f64,
+    gradient: DVec2,
+}
+
 /// The disc of a tool on a solid, at a place of its surface.
 #[derive(Debug, Clone)]
 pub(crate) struct SolidDisc {
     shape: Arc<SolidShape>,
     disc: MeshDisc,
-    /// Weight and derivative of each covered point, by ascending point.
-    covered: Vec<(u32, f64, DVec2)>,
+    /// What each vertex gives to its points; kept, so that a step allocates nothing.
+    covered: Vec<CoveredPart>,
 }
 
 impl SolidDisc {
@@ -94,15 +104,19 @@ impl TissueDisc for SolidDisc {
         covered.clear();
         disc.cover(&mut |vertex, weight, gradient| {
             let CellPlace { points, weights } = shape.cell_of(vertex.index());
-            let of_points = points.iter().zip(weights).filter(|(_, part)| **part > 0.0);
-            covered.extend(of_points.map(|(point, part)| (*point, part * weight, *part * gradient)));
+            for (point, part) in points.iter().zip(weights).filter(|(_, part)| **part > 0.0) {
+                let order = u32::try_from(covered.len()).unwrap_or(u32::MAX);
+                covered.push(CoveredPart { point: *point, order, weight: part * weight, gradient: *part * gradient });
+            }
         });
-        covered.sort_by_key(|of_point| of_point.0);
-        for of_point in covered.chunk_by(|a, b| a.0 == b.0) {
-            let sum =
-                |(weight, gradient): (f64, DVec2), (_, more, by): &(u32, f64, DVec2)| (weight + more, gradient + *by);
-            let (weight, gradient) = of_point.iter().fold((0.0, DVec2::ZERO), sum);
-            add(PointId::new(of_point[0].0 as usize), weight, gradient);
+        covered.sort_unstable_by_key(|part| (part.point, part.order));
+        for of_point in covered.chunk_by(|a, b| a.point == b.point) {
+            let (mut weight, mut gradient) = (0.0, DVec2::ZERO);
+            for part in of_point {
+                weight += part.weight;
+                gradient += part.gradient;
+            }
+            add(PointId::new(of_point[0].point as usize), weight, gradient);
         }
     }
 }

@@ -45,18 +45,26 @@ pub(crate) struct CellLaw<T> {
     bulk: T,
 }
 
-/// The force of a cube on the rows of its corners along x, by component: near in y and z, far in y, far in z, far in both.
+/// One component of the force of a cube on the rows of its corners along x: near in y and z, far in y, far in z, far in
+/// both.
 pub(crate) struct RowForces<V> {
     /// The mean force of both corners of a row.
-    pub(crate) even: [[V; 4]; 3],
+    pub(crate) even: [V; 4],
     /// Half the difference: the corner farther along x gets even + odd, the other one even − odd.
-    pub(crate) odd: [[V; 4]; 3],
+    pub(crate) odd: [V; 4],
 }
 
 /// The patterns of a cube: h and the hourglasses g₁ to g₄, by component.
-pub(super) struct Patterns<V> {
+pub(crate) struct Patterns<V> {
     pub(super) h: [[V; 3]; 3],
     pub(super) g: [[V; 4]; 3],
+}
+
+/// What a cube's patterns pull with: 16 P and the factors of the first three hourglasses and of the fourth, all times the
+/// weight.
+pub(crate) struct Stress<V> {
+    p: [[V; 3]; 3],
+    hours: [V; 2],
 }
 
 /// Returns the patterns of one component, from the sums and differences along x of the four rows.
@@ -68,6 +76,49 @@ fn patterns<V: Vector>([s00, s10, s01, s11]: [V; 4], [d00, d10, d01, d11]: [V; 4
     ([ds1.add(ds0), sd1.add(sd0), ss1.sub(ss0)], [sd1.sub(sd0), ds1.sub(ds0), dd1.add(dd0), dd1.sub(dd0)])
 }
 
+impl<V: Vector> Patterns<V> {
+    /// Returns the patterns of cubes at rest.
+    #[inline(always)]
+    pub(crate) fn at_rest(zero: V) -> Self {
+        Patterns { h: [[zero; 3]; 3], g: [[zero; 4]; 3] }
+    }
+
+    /// Sets a component, from the displacements of the corners nearer along x by row, and of those farther.
+    #[inline(always)]
+    pub(crate) fn set(&mut self, c: usize, near: [V; 4], far: [V; 4]) {
+        let (mut sums, mut differences) = (near, near);
+        for row in 0..4 {
+            sums[row] = far[row].add(near[row]);
+            differences[row] = far[row].sub(near[row]);
+        }
+        (self.h[c], self.g[c]) = patterns(sums, differences);
+    }
+}
+
+impl<V: Vector> Stress<V> {
+    /// Creates it from 16 P and the factor μ/E, both times the weight.
+    #[inline(always)]
+    pub(super) fn of(p: [[V; 3]; 3], shear: V) -> Self {
+        let hour = |factor: f64| shear.mul(shear.splat(V::Real::of(factor)));
+        Stress { p, hours: [hour(8.0 / 3.0), hour(4.0 / 3.0)] }
+    }
+
+    /// Returns a component of the forces on the corners.
+    #[inline(always)]
+    pub(crate) fn on_rows(&self, patterns: &Patterns<V>, c: usize) -> RowForces<V> {
+        let ([px, py, pz], [g1, g2, g3, g4], [three, one]) = (self.p[c], patterns.g[c], self.hours);
+        let zero = px.splat(V::Real::default());
+        let (py_less, py_more) = (py.minus(three, g1), three.mul_add(g1, py));
+        let (px_less, px_more) = (px.minus(three, g2), three.mul_add(g2, px));
+        let third = three.mul(g3);
+        let (third_less, third_more) = (third.minus(one, g4), one.mul_add(g4, third));
+        RowForces {
+            even: [zero.sub(py_less).sub(pz), py_less.sub(pz), pz.sub(py_more), pz.add(py_more)],
+            odd: [px_less.sub(third_less), px_less.add(third_less), px_more.sub(third_more), px_more.add(third_more)],
+        }
+    }
+}
+
 impl<T: Real> CellLaw<T> {
     /// Creates the law of a material with μ/E = `shear` and λ/E = `lame`. `stiffness` is k = E·a times the factor to the
     /// scheme's units of force.
@@ -76,22 +127,19 @@ impl<T: Real> CellLaw<T> {
         CellLaw { shear: T::of(unit * shear), bulk: T::of(unit * (lame + shear) / 4.0) }
     }
 
-    /// Returns the forces of cubes of weight `w`. `near` has the displacements of the corners nearer along x, by component
-    /// and row, `far` those of the others.
+    /// Returns what cubes of weight `w` pull with.
     #[inline(always)]
-    pub(crate) fn forces<V: Vector<Real = T>>(&self, w: V, near: &[[V; 4]; 3], far: &[[V; 4]; 3]) -> RowForces<V> {
-        let Patterns { h, g } = Self::all_patterns(near, far);
+    pub(crate) fn stress<V: Vector<Real = T>>(&self, w: V, Patterns { h, .. }: &Patterns<V>) -> Stress<V> {
         let shear = w.mul(w.splat(self.shear));
         let bulk = w.mul(w.splat(self.bulk));
-        let (cofactor, trace, growth) = invariants(&h);
+        let (cofactor, trace, growth) = invariants(h);
         let pressure = limited(&cofactor, trace, bulk.mul(growth), shear);
         // 16 P, all times the weight: 4μ·h + q·(cof h − 4hᵀ) + (16 p + 4 q·tr h)·I, here q = p − μ and `pressure` 16 p.
         let (sixteenth, four) = (w.splat(T::of(0.0625)), w.splat(T::of(4.0)));
         let q = pressure.mul(sixteenth).sub(shear);
         let (shear_four, q_four) = (shear.mul(four), q.mul(four));
         let spherical = q_four.mul_add(trace, pressure);
-        let zero = w.splat(T::default());
-        let mut p = [[zero; 3]; 3];
+        let mut p = [[w; 3]; 3];
         for c in 0..3 {
             for along in 0..3 {
                 let own =
@@ -99,27 +147,23 @@ impl<T: Real> CellLaw<T> {
                 p[c][along] = q.mul_add(cofactor[c][along], own);
             }
         }
-        spread(&p, &g, shear)
+        Stress::of(p, shear)
     }
 
-    /// Returns the energy of cubes, in the scheme's units of force times edges: as [`CellLaw::forces`], without the limits
-    /// but with the reduced pressure.
+    /// Returns the energy of cubes, in the scheme's units of force times edges: that of [`CellLaw::stress`], with the
+    /// reduced pressure.
     #[inline(always)]
-    pub(crate) fn energy<V: Vector<Real = T>>(&self, w: V, near: &[[V; 4]; 3], far: &[[V; 4]; 3]) -> V {
-        let Patterns { h, g } = Self::all_patterns(near, far);
+    pub(crate) fn energy<V: Vector<Real = T>>(&self, w: V, Patterns { h, g }: &Patterns<V>) -> V {
         let shear = w.mul(w.splat(self.shear));
         let bulk = w.mul(w.splat(self.bulk));
-        let (cofactor, trace, growth) = invariants(&h);
+        let (cofactor, trace, growth) = invariants(h);
         let zero = w.splat(T::default());
-        let (mut squares, mut hours) = (zero, zero);
+        let (mut squares, mut hours, mut last) = (zero, zero, zero);
         for c in 0..3 {
             for along in 0..3 {
                 squares = h[c][along].mul_add(h[c][along], squares);
                 hours = g[c][along].mul_add(g[c][along], hours);
             }
-        }
-        let mut last = zero;
-        for c in 0..3 {
             last = g[c][3].mul_add(g[c][3], last);
         }
         // 64(J − 1) = 16 tr h + 4 tr cof h + det h: so what is subtracted, 4 tr cof h + det h, is this less 16 tr h.
@@ -131,43 +175,6 @@ impl<T: Real> CellLaw<T> {
         let swelling = pressure.mul(growth).mul(w.splat(T::of(1.0 / 32.0)));
         shear.mul_add(of_h.add(of_g), swelling)
     }
-
-    /// Returns the patterns of cubes.
-    #[inline(always)]
-    pub(super) fn all_patterns<V: Vector<Real = T>>(near: &[[V; 4]; 3], far: &[[V; 4]; 3]) -> Patterns<V> {
-        let zero = near[0][0];
-        let mut all = Patterns { h: [[zero; 3]; 3], g: [[zero; 4]; 3] };
-        for c in 0..3 {
-            let (mut sums, mut differences) = ([zero; 4], [zero; 4]);
-            for row in 0..4 {
-                sums[row] = far[c][row].add(near[c][row]);
-                differences[row] = far[c][row].sub(near[c][row]);
-            }
-            (all.h[c], all.g[c]) = patterns(sums, differences);
-        }
-        all
-    }
-}
-
-/// Returns the forces on the corners of cubes from 16 P and the hourglasses, both times the weight: `shear` is that of μ/E.
-#[inline(always)]
-pub(super) fn spread<V: Vector>(p: &[[V; 3]; 3], g: &[[V; 4]; 3], shear: V) -> RowForces<V> {
-    let zero = shear.splat(V::Real::default());
-    let (hour_three, hour_one) =
-        (shear.mul(zero.splat(V::Real::of(8.0 / 3.0))), shear.mul(zero.splat(V::Real::of(4.0 / 3.0))));
-    let mut forces = RowForces { even: [[zero; 4]; 3], odd: [[zero; 4]; 3] };
-    for c in 0..3 {
-        let [px, py, pz] = p[c];
-        let [g1, g2, g3, g4] = g[c];
-        let (py_less, py_more) = (py.minus(hour_three, g1), hour_three.mul_add(g1, py));
-        forces.even[c] = [zero.sub(py_less).sub(pz), py_less.sub(pz), pz.sub(py_more), pz.add(py_more)];
-        let (px_less, px_more) = (px.minus(hour_three, g2), hour_three.mul_add(g2, px));
-        let third = hour_three.mul(g3);
-        let (third_less, third_more) = (third.minus(hour_one, g4), hour_one.mul_add(g4, third));
-        forces.odd[c] =
-            [px_less.sub(third_less), px_less.add(third_less), px_more.sub(third_more), px_more.add(third_more)];
-    }
-    forces
 }
 
 /// Returns cof h − 4hᵀ (16 times cof F less its diagonal part), tr h, and 64(J − 1).

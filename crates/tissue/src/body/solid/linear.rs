@@ -9,7 +9,7 @@ use std::cell::RefCell;
 
 use glam::{DMat3, DVec3};
 
-use super::law::{CellLaw, RowForces, invariants, spread};
+use super::law::{CellLaw, Patterns, Stress, invariants};
 use super::places::SolidPlaces;
 use crate::kernel::lanes::{self, Scalar, SingleWork};
 
@@ -44,19 +44,33 @@ pub(crate) struct LinearCells {
     lame: f64,
 }
 
-fn ones(corners: &[DVec3; 8], far: usize) -> [[One; 4]; 3] {
-    [0, 1, 2].map(|c| [0, 1, 2, 3].map(|row| Scalar(corners[2 * row + far][c])))
+/// Returns the patterns of a cube.
+#[inline(always)]
+fn patterns_of(corners: &[DVec3; 8]) -> Patterns<One> {
+    let mut patterns = Patterns::at_rest(Scalar(0.0));
+    for c in 0..3 {
+        let (mut near, mut far) = ([Scalar(0.0); 4], [Scalar(0.0); 4]);
+        for row in 0..4 {
+            near[row] = Scalar(corners[2 * row][c]);
+            far[row] = Scalar(corners[2 * row + 1][c]);
+        }
+        patterns.set(c, near, far);
+    }
+    patterns
 }
 
 /// Returns the force on each corner, outward: what resists the displacement that causes it.
-fn resisting(forces: &RowForces<One>) -> [DVec3; 8] {
-    std::array::from_fn(|corner| {
-        let of = |c: usize| {
-            let (even, odd) = (forces.even[c][corner / 2].0, forces.odd[c][corner / 2].0);
-            if corner % 2 == 1 { even + odd } else { even - odd }
-        };
-        DVec3::new(of(0), of(1), of(2))
-    })
+#[inline(always)]
+fn resisting(stress: &Stress<One>, patterns: &Patterns<One>) -> [DVec3; 8] {
+    let mut forces = [DVec3::ZERO; 8];
+    for c in 0..3 {
+        let of = stress.on_rows(patterns, c);
+        for row in 0..4 {
+            forces[2 * row][c] = of.even[row].0 - of.odd[row].0;
+            forces[2 * row + 1][c] = of.even[row].0 + of.odd[row].0;
+        }
+    }
+    forces
 }
 
 impl LinearCells {
@@ -117,11 +131,11 @@ impl LinearCells {
                 let moved_m = if point == BEYOND { DVec3::ZERO } else { displacement_m[point as usize] };
                 back * moved_m / *edge_m
             });
-            let (near, far) = (ones(&corners, 0), ones(&corners, 1));
-            let forces = law.forces(Scalar(cell.weight), &near, &far);
-            cell.forces_n = resisting(&forces).map(|force_n| *turn * -force_n);
-            let h = CellLaw::all_patterns(&near, &far).h;
-            let (cofactor, trace, growth) = invariants(&h);
+            let patterns = patterns_of(&corners);
+            let stress = law.stress(Scalar(cell.weight), &patterns);
+            cell.forces_n = resisting(&stress, &patterns).map(|force_n| *turn * -force_n);
+            let h = &patterns.h;
+            let (cofactor, trace, growth) = invariants(h);
             for i in 0..3 {
                 for j in 0..3 {
                     cell.h[i][j] = h[i][j].0;
@@ -165,9 +179,9 @@ impl LinearCells {
                     let point = cell.points[corner];
                     if point == BEYOND { DVec3::ZERO } else { back * x[point as usize][system] }
                 });
-                let patterns = CellLaw::<f64>::all_patterns(&ones(&corners, 0), &ones(&corners, 1));
-                let p = self.stress(cell, &patterns.h, c);
-                let forces = resisting(&spread(&p, &patterns.g, Scalar(c * self.shear)));
+                let patterns = patterns_of(&corners);
+                let stress = Stress::of(self.stress(cell, &patterns.h, c), Scalar(c * self.shear));
+                let forces = resisting(&stress, &patterns);
                 for corner in 0..8 {
                     let point = cell.points[corner];
                     if point != BEYOND {

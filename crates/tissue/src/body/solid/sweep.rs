@@ -17,7 +17,7 @@
 use std::cell::RefCell;
 use std::ops::Range;
 
-use super::law::CellLaw;
+use super::law::{CellLaw, Patterns};
 use super::places::SolidPlaces;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::{Run, Scalar, Vector};
@@ -159,27 +159,39 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
                 }
                 if group == CUBES {
                     let w = V::load(tables.weights.as_ptr().add(at));
-                    let (mut near, mut far) = ([[zero; 4]; 3], [[zero; 4]; 3]);
+                    let mut patterns = Patterns::at_rest(zero);
                     for c in 0..3 {
                         let from = x.add(c * plane + at);
-                        for (row, by) in [0, stride, layer, layer + stride].into_iter().enumerate() {
-                            near[c][row] = V::load(from.add(by));
-                            far[c][row] = V::load(from.add(by + 1));
-                        }
+                        let (up, beyond) = (from.add(layer), from.add(1));
+                        let far_up = up.add(1);
+                        patterns.set(
+                            c,
+                            [V::load(from), V::load(from.add(stride)), V::load(up), V::load(up.add(stride))],
+                            [
+                                V::load(beyond),
+                                V::load(beyond.add(stride)),
+                                V::load(far_up),
+                                V::load(far_up.add(stride)),
+                            ],
+                        );
                     }
                     if S::ENERGY {
-                        self.stage.energy(column, law.energy(w, &near, &far));
+                        self.stage.energy(column, law.energy(w, &patterns));
                     }
-                    let forces = law.forces(w, &near, &far);
+                    let stress = law.stress(w, &patterns);
                     for c in 0..3 {
-                        for (part, own, sum) in [(0, &forces.even[c], &mut even[c]), (1, &forces.odd[c], &mut odd[c])] {
-                            let place = (2 * c + part) * stride + column;
-                            let corner = of_corner.add(place);
-                            *sum = sum.add(own[0]);
-                            own[1].store(of_row.add(place));
-                            own[2].add(V::load(corner)).store(of_plane.add(place));
-                            own[3].store(corner);
-                        }
+                        let forces = stress.on_rows(&patterns, c);
+                        even[c] = even[c].add(forces.even[0]);
+                        odd[c] = odd[c].add(forces.odd[0]);
+                        let place = 2 * c * stride + column;
+                        let corner = of_corner.add(place);
+                        forces.even[2].add(V::load(corner)).store(of_plane.add(place));
+                        forces.even[3].store(corner);
+                        forces.even[1].store(of_row.add(place));
+                        let (place, corner) = (place + stride, corner.add(stride));
+                        forces.odd[2].add(V::load(corner)).store(of_plane.add(place));
+                        forces.odd[3].store(corner);
+                        forces.odd[1].store(of_row.add(place));
                     }
                 } else {
                     for part in 0..6 {
@@ -229,18 +241,24 @@ pub(crate) fn gather<T: Real>(
         for row in 0..4 {
             let Some(cube) = cubes[row] else { continue };
             let corners = places.corners_of(cube);
-            let (mut near, mut far) = ([[zero; 4]; 3], [[zero; 4]; 3]);
-            for of_cube in 0..4 {
-                let (here, beyond) = (layout.offset(corners[2 * of_cube]), layout.offset(corners[2 * of_cube + 1]));
-                for c in 0..3 {
-                    near[c][of_cube] = Scalar(u[c * layout.plane + here]);
-                    far[c][of_cube] = Scalar(u[c * layout.plane + beyond]);
-                }
+            let mut offsets = [0; 8];
+            for corner in 0..8 {
+                offsets[corner] = layout.offset(corners[corner]);
             }
-            let forces = law.forces(Scalar(T::of(places.weight(cube))), &near, &far);
+            let mut patterns = Patterns::at_rest(zero);
             for c in 0..3 {
-                parts[beside][0][c][row] = forces.even[c][row];
-                parts[beside][1][c][row] = forces.odd[c][row];
+                let (mut near, mut far) = ([zero; 4], [zero; 4]);
+                for of_cube in 0..4 {
+                    near[of_cube] = Scalar(u[c * layout.plane + offsets[2 * of_cube]]);
+                    far[of_cube] = Scalar(u[c * layout.plane + offsets[2 * of_cube + 1]]);
+                }
+                patterns.set(c, near, far);
+            }
+            let stress = law.stress(Scalar(T::of(places.weight(cube))), &patterns);
+            for c in 0..3 {
+                let forces = stress.on_rows(&patterns, c);
+                parts[beside][0][c][row] = forces.even[row];
+                parts[beside][1][c][row] = forces.odd[row];
             }
         }
     }

@@ -1,12 +1,12 @@
 //! Tests of the cube's law against derivatives and closed forms, and of the sweep against single points.
-#![allow(unsafe_code, clippy::unwrap_used)]
+#![allow(unsafe_code, clippy::unwrap_used, clippy::needless_range_loop)]
 
 use std::cell::UnsafeCell;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
-use super::CellLaw;
+use super::law::{CellLaw, Patterns};
 use super::linear::LinearCells;
 use crate::body::Places;
 use crate::body::model::{Model, Plan};
@@ -26,16 +26,22 @@ const LAME: f64 = 2.1;
 /// Displacements of the corners of a cube, x before y before z.
 type Corners = [DVec3; 8];
 
-fn rows(corners: &Corners) -> [[[Scalar<f64>; 4]; 3]; 2] {
-    [0, 1].map(|far| [0, 1, 2].map(|c| [0, 1, 2, 3].map(|row| Scalar(corners[2 * row + far][c]))))
+fn patterns(corners: &Corners) -> Patterns<Scalar<f64>> {
+    let mut patterns = Patterns::at_rest(Scalar(0.0));
+    for c in 0..3 {
+        let [near, far] = [0, 1].map(|far| [0, 1, 2, 3].map(|row| Scalar(corners[2 * row + far][c])));
+        patterns.set(c, near, far);
+    }
+    patterns
 }
 
 fn forces(corners: &Corners) -> Corners {
-    let [near, far] = rows(corners);
-    let found = CellLaw::new(1.0, SHEAR, LAME).forces(Scalar(0.7), &near, &far);
+    let patterns = patterns(corners);
+    let stress = CellLaw::new(1.0, SHEAR, LAME).stress(Scalar(0.7), &patterns);
+    let found = [0, 1, 2].map(|c| stress.on_rows(&patterns, c));
     std::array::from_fn(|corner| {
         let of = |c: usize| {
-            let (even, odd) = (found.even[c][corner / 2].0, found.odd[c][corner / 2].0);
+            let (even, odd) = (found[c].even[corner / 2].0, found[c].odd[corner / 2].0);
             // What the corner pulls with; the tissue pulls the other way.
             -if corner % 2 == 1 { even + odd } else { even - odd }
         };
@@ -44,8 +50,7 @@ fn forces(corners: &Corners) -> Corners {
 }
 
 fn energy(corners: &Corners) -> f64 {
-    let [near, far] = rows(corners);
-    CellLaw::new(1.0, SHEAR, LAME).energy(Scalar(0.7), &near, &far).0
+    CellLaw::new(1.0, SHEAR, LAME).energy(Scalar(0.7), &patterns(corners)).0
 }
 
 /// The corners at rest, in edges.

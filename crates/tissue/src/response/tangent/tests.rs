@@ -6,7 +6,8 @@ use std::sync::Arc;
 use glam::DVec2;
 
 use super::*;
-use crate::body::window::{REACHES, Spring, half_window_m};
+use crate::body::bonds::Spring;
+use crate::body::window::{REACHES, half_window_m};
 use crate::limits::Limits;
 use crate::scene::Scene;
 use crate::scene::{FixedPoints, Sheet};

@@ -7,7 +7,6 @@ use palpate_geometry::fill::{Lattice, filled};
 use palpate_geometry::subdivide::subdivide;
 use palpate_geometry::{Group, TriangleMesh};
 
-use super::CellSize;
 use super::fixed::{FixedPart, along_axis};
 use crate::limits::Limits;
 use crate::scene::mesh::{MeshShape, group_named};
@@ -20,11 +19,25 @@ const NO_POINT: u32 = u32::MAX;
 
 /// Largest part of the rays that may run through holes of the surface. (Parts of a surface that touch in an edge make
 /// some.)
-const MOST_OPEN: f64 = 0.002;
+const MAX_OPEN: f64 = 0.002;
 
 /// Vertices of the surface that tools touch: its edges are split until they are as long as those of a cube, or until there
 /// are as many.
-const MOST_VERTICES: usize = 400_000;
+const MAX_VERTICES: usize = 400_000;
+
+/// How large the cubes of a solid are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CellSize {
+    /// Edges of this length, m.
+    Edge(f64),
+    /// About this many cubes.
+    Count(f64),
+}
+
+impl CellSize {
+    /// That of a scene that gives neither the size of cubes nor their number.
+    pub const USUAL: Self = CellSize::Count(20_000.0);
+}
 
 /// The rest shape of a solid. Its points are the corners of the cubes that are inside the surface or meet it, numbered in
 /// the order of the lattice: x runs fastest, then y. Frames show the surface.
@@ -78,7 +91,7 @@ impl SolidShape {
         }
         let lattice = lattice_around(extent, edge_m, fixed);
         let found = filled(&mesh.vertices_m, &mesh.triangles, &lattice);
-        if found.open_part > MOST_OPEN {
+        if found.open_part > MAX_OPEN {
             let [x, y, z] = found.open_at_m.unwrap_or_default().to_array().map(legible);
             let message = format!(
                 "is not closed: {:.1} % of the lines across it pass through a hole, one at ({x}, {y}, {z}) m; \
@@ -90,7 +103,7 @@ impl SolidShape {
         if found.parts.iter().all(|part| *part == 0.0) {
             return Err(refuse("encloses nothing".to_owned()));
         }
-        let most = MOST_VERTICES.max(mesh.vertices_m.len());
+        let most = MAX_VERTICES.max(mesh.vertices_m.len());
         subdivide(&mut mesh, 0.5 * edge_m, most);
         let groups = mesh.groups;
         let surface = MeshShape::new(mesh.vertices_m, mesh.triangles, |_, _, _| false);
@@ -440,15 +453,12 @@ impl RestShape for SolidShape {
         found
     }
 
+    /// Of a place that is near no point, it is the point that moves most with the nearest vertex of the surface.
     fn nearest(&self, place_m: DVec3) -> PointId {
         let at = self.lattice.from_m(place_m);
         let corner = [0, 1, 2].map(|axis| whole((at[axis] + 0.5).floor()).min(self.lattice.cells[axis]));
-        self.point_at(corner).unwrap_or_else(|| {
-            let CellPlace { points, .. } = self.bind(place_m);
-            let away = |point: u32| self.rest_m(PointId::new(point as usize)).distance_squared(place_m);
-            let nearest = points.into_iter().min_by(|a, b| away(*a).total_cmp(&away(*b))).unwrap_or(0);
-            PointId::new(nearest as usize)
-        })
+        self.point_at(corner)
+            .unwrap_or_else(|| self.bound[nearest_vertex(&self.surface, place_m) as usize].most_moving())
     }
 
     fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {
