@@ -50,13 +50,11 @@ impl Sessions {
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
         let source = request.source;
-        let mesh = match &source {
-            Some(Source::Scene(scene)) => match palpate_proto::scene::mesh_id(scene) {
-                Some(mesh_id) => Some(self.0.meshes.get(mesh_id, &account)?),
-                None => None,
-            },
+        let mesh_id = match &source {
+            Some(Source::Scene(scene)) => palpate_proto::scene::mesh_id(scene),
             _ => None,
         };
+        let mesh = mesh_id.map(|mesh_id| self.0.meshes.get(mesh_id, &account)).transpose()?;
         let (catalog, config, recorded) = (self.0.catalog.clone(), self.0.config.clone(), self.0.recorded.clone());
         let birth = match &self.0.fleet {
             Some(fleet) => fleet.birth().await?,

@@ -61,7 +61,7 @@ pub struct Filled {
 
 /// A ray crosses the surface.
 #[derive(Debug, Clone, Copy)]
-struct Crossing {
+struct RayCrossing {
     ray: u32,
     /// Height in edges.
     height: f64,
@@ -120,7 +120,7 @@ fn place_of([x, y]: [usize; 2]) -> DVec2 {
 
 /// Returns the crossings of all rays, by ray and height.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-fn crossings(vertices_m: &[DVec3], triangles: &[[u32; 3]], lattice: &Lattice) -> Vec<Crossing> {
+fn crossings(vertices_m: &[DVec3], triangles: &[[u32; 3]], lattice: &Lattice) -> Vec<RayCrossing> {
     let [columns, lines] = [lattice.cells[0] * RAYS, lattice.cells[1] * RAYS];
     let mut crossings = Vec::new();
     for triangle in triangles {
@@ -153,7 +153,7 @@ fn crossings(vertices_m: &[DVec3], triangles: &[[u32; 3]], lattice: &Lattice) ->
                 if height.is_finite() {
                     let ray = (y * columns + x) as u32;
                     // A triangle that is anticlockwise seen from above has the inside below it.
-                    crossings.push(Crossing { ray, height, into: if is_up { -1 } else { 1 } });
+                    crossings.push(RayCrossing { ray, height, into: if is_up { -1 } else { 1 } });
                 }
             }
         }

@@ -265,9 +265,9 @@ pub(crate) fn has_area(vertices: &[DVec3], triangle: [u32; 3]) -> bool {
     is_proper(&triangle) && area(corners(vertices, triangle)).1
 }
 
-/// The volume that oriented triangles enclose, m³, with a sign: Σ a·(b × c)/6, the tetrahedra between each triangle
-/// and one point, which is near them, so that no digits are lost.
-pub(crate) fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
+/// Returns the volume that oriented triangles enclose, m³, with a sign: Σ a·(b × c)/6, the tetrahedra between each triangle
+/// and one point, which is near them, so that no digits are lost. Panics if a triangle names a vertex that is not there.
+pub fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
     let middle = triangles.first().map(|triangle| vertices[triangle[0] as usize]).unwrap_or_default();
     let of = |triangle: &[u32; 3]| {
         let [a, b, c] = corners(vertices, *triangle).map(|at| at - middle);

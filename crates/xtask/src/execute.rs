@@ -46,22 +46,15 @@ pub(crate) fn execute(stages: &[PlanStage]) -> Result<(), TaskFailure> {
         match stage {
             PlanStage::Step(step) => run(step)?,
             PlanStage::Beside { step, others, without } => {
-                let others = others.clone();
-                let beside = std::thread::spawn(move || others.iter().try_for_each(run));
-                let ended = run(step);
-                if let Err(failure) =
-                    beside.join().map_err(|_| TaskFailure::Failed("a thread has failed".to_owned())).flatten()
-                {
+                let (ended, beside) = run_with(step, others);
+                if let Err(failure) = beside {
                     eprintln!("{failure}");
                     eprintln!("{without}");
                 }
                 ended?;
             }
             PlanStage::Together { step, others } => {
-                let others = others.clone();
-                let beside = std::thread::spawn(move || others.iter().try_for_each(run));
-                let ended = run(step);
-                let beside = beside.join().map_err(|_| TaskFailure::Failed("a thread has failed".to_owned())).flatten();
+                let (ended, beside) = run_with(step, others);
                 ended.and(beside)?;
             }
             PlanStage::Mark(file) => {
@@ -73,6 +66,15 @@ pub(crate) fn execute(stages: &[PlanStage]) -> Result<(), TaskFailure> {
         }
     }
     Ok(())
+}
+
+/// Runs a step, and others one after another at the same time. Returns the result of the step, and that of the others, of
+/// which none runs after one that fails.
+fn run_with(step: &Step, others: &[Step]) -> (Result<(), TaskFailure>, Result<(), TaskFailure>) {
+    let others = others.to_vec();
+    let beside = std::thread::spawn(move || others.iter().try_for_each(run));
+    let ended = run(step);
+    (ended, beside.join().map_err(|_| TaskFailure::Failed("a thread has failed".to_owned())).flatten())
 }
 
 /// Returns a step as a command of the system.

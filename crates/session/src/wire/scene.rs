@@ -84,13 +84,11 @@ fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
 }
 
 fn from_sheet(message: &pb::Scene) -> Result<Substance> {
-    let for_a_mesh = [("material", message.material.is_some()), ("inclusions", !message.inclusions.is_empty())];
-    if let Some((field, _)) = for_a_mesh.iter().find(|(_, is_there)| *is_there) {
-        return Err(Refusal::new(Reason::WrongKind, *field, Material::OF_A_MESH));
-    }
-    if message.volume.is_some() {
-        return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH));
-    }
+    refuse_given([
+        ("material", message.material.is_some(), Material::OF_A_MESH),
+        ("inclusions", !message.inclusions.is_empty(), Material::OF_A_MESH),
+        ("volume", message.volume.is_some(), Volume::OF_A_MESH),
+    ])?;
     if message.springs.is_some_and(|springs| springs.bending_factor.is_some()) {
         let message = "is for meshes: a sheet has springs of bending (`bending`) or none";
         return Err(Refusal::new(Reason::WrongKind, "springs.bending_factor", message));
@@ -158,17 +156,13 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
 }
 
 fn from_solid(message: &pb::Scene, of_solid: &pb::Solid, mesh: &TriangleMesh) -> Result<Substance> {
-    for (field, is_there, why) in [
+    refuse_given([
         ("material", message.material.is_some(), SolidMaterial::FOLLOWS),
         ("springs", message.springs.is_some(), SolidMaterial::FOLLOWS),
         ("anchor_springs", message.anchor_springs.is_some(), SolidMaterial::FOLLOWS),
         ("damping", message.damping.is_some(), SolidMaterial::FOLLOWS),
         ("volume", message.volume.is_some(), Volume::OF_A_MESH),
-    ] {
-        if is_there {
-            return Err(Refusal::new(Reason::WrongKind, field, why));
-        }
-    }
+    ])?;
     let usual = SolidMaterial::usual();
     let material = SolidMaterial {
         youngs_modulus_pa: required("solid.youngs_modulus_pa", of_solid.youngs_modulus_pa)?,
@@ -222,18 +216,21 @@ fn from_material(message: &pb::Material) -> Result<Material> {
 /// Refuses coefficients that follow from a material.
 fn refuse_coefficients(message: &pb::Scene, of_mesh: &pb::Mesh) -> Result<()> {
     let springs = message.springs.unwrap_or_default();
-    for (field, is_there, why) in [
+    refuse_given([
         ("mesh.point_mass_kg", of_mesh.point_mass_kg.is_some(), Mesh::WEIGHED),
         ("anchor_springs", message.anchor_springs.is_some(), Material::FOLLOWS),
         ("damping", message.damping.is_some(), Material::FOLLOWS),
         ("springs.stiffness_n_per_m", springs.stiffness_n_per_m.is_some(), Material::FOLLOWS),
         ("springs.shear_stiffness_n_per_m", springs.shear_stiffness_n_per_m.is_some(), Material::FOLLOWS),
-    ] {
-        if is_there {
-            return Err(Refusal::new(Reason::WrongKind, field, why));
-        }
+    ])
+}
+
+/// Refuses the first field that is given, with the reason why it can't be.
+fn refuse_given<const N: usize>(fields: [(&str, bool, &str); N]) -> Result<()> {
+    match fields.into_iter().find(|(_, is_there, _)| *is_there) {
+        Some((field, _, why)) => Err(Refusal::new(Reason::WrongKind, field, why)),
+        None => Ok(()),
     }
-    Ok(())
 }
 
 fn from_inclusion((index, message): (usize, &pb::Inclusion)) -> Result<Inclusion> {

@@ -2,8 +2,8 @@
 //! the contact of a disc with it.
 
 mod advance;
-pub(crate) mod bonds;
 pub(crate) mod disc;
+pub(crate) mod elements;
 pub(crate) mod footprint;
 pub(crate) mod force_field;
 pub mod model;

@@ -10,7 +10,7 @@ use crate::body::force_field::{self, Pull, Term};
 use crate::body::model::{Model, Plan};
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
-use crate::body::solid::{self, CellLaw, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
+use crate::body::solid::{self, NeoHookean, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
@@ -32,7 +32,7 @@ pub(crate) enum Elastic<T> {
     /// the factor of the extra anchor stiffness; and the factor of the growth of a volume.
     Mesh(Arc<MeshPlaces>, SpringCoefficients<T>, T, f64),
     /// A solid: its places, and the law of its cubes.
-    Solid(Arc<SolidPlaces>, CellLaw<T>),
+    Solid(Arc<SolidPlaces>, NeoHookean<T>),
 }
 
 impl<T: Real> Elastic<T> {
@@ -84,7 +84,7 @@ pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
         Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
         Places::Solid(places) => {
             let (stiffness, [shear, lame]) = (unit * model.scene.springs.stiffness_n_per_m, places.lame_over_youngs());
-            Elastic::Solid(places.clone(), CellLaw::new(stiffness, shear, lame))
+            Elastic::Solid(places.clone(), NeoHookean::new(stiffness, shear, lame))
         }
         Places::Surface(places) => Elastic::Mesh(
             places.clone(),

@@ -3,10 +3,10 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::body::Places;
-use crate::body::bonds::{Bonds, Spring};
+use crate::body::elements::{Elements, Spring};
 use crate::body::footprint::Footprint;
 use crate::body::model::Model;
-use crate::body::solid::linear::LinearCells;
+use crate::body::solid::linear_cells::LinearCells;
 use crate::scheme::Relaxation;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
@@ -151,17 +151,17 @@ impl Window {
     }
 
     /// Returns what joins points of the window, at least one of which is `free`. Rest vectors are turned by `turn`.
-    pub(crate) fn bonds(&self, model: &Model, free: &[bool], turn: &DMat3) -> Bonds {
+    pub(crate) fn elements(&self, model: &Model, free: &[bool], turn: &DMat3) -> Elements {
         if let (Places::Solid(places), Window::Ball(part)) = (&model.places, self) {
             let stiffness_n_per_m = model.scene.springs.stiffness_n_per_m;
-            return Bonds::Cells(LinearCells::of(places, part, stiffness_n_per_m, model.unit_m, turn));
+            return Elements::Cells(LinearCells::of(places, part, stiffness_n_per_m, model.unit_m, turn));
         }
         let mut springs = match self {
             Window::Ball(slots) => of_mesh(model, slots, free),
             Window::Grid { size, .. } => of_grid(model, *size, free),
         };
         springs.iter_mut().for_each(|spring| spring.rest_m = *turn * spring.rest_m);
-        Bonds::Springs(springs)
+        Elements::Springs(springs)
     }
 
     /// Returns Σ m·|∂u/∂x|² over the points, the mean of both directions of the surface, with the relative `masses` of

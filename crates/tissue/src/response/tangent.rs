@@ -20,7 +20,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::body::MemoryLayout;
-use crate::body::bonds::Bonds;
+use crate::body::elements::Elements;
 use crate::body::footprint::{Footprint, WeightedNode};
 use crate::body::model::Model;
 use crate::body::window::Window;
@@ -96,7 +96,7 @@ pub struct LinearPatch<'m> {
     /// Mass and K″ of each point divided by the reference values.
     masses: Vec<f64>,
     stiffness: Vec<f64>,
-    bonds: Bonds,
+    elements: Elements,
     pressure: Option<SharedPressure>,
     inverses: Vec<DMat3>,
     accuracy: Accuracy,
@@ -185,7 +185,7 @@ impl<'m> LinearPatch<'m> {
     /// Creates the patch of a window with given weights of the points. Directions are turned by `turn`.
     fn weighted(model: &'m Model, weights: Vec<f64>, window: Window, displacement_m: Vec<DVec3>, turn: &DMat3) -> Self {
         let free = window.free(model);
-        let bonds = window.bonds(model, &free, turn);
+        let elements = window.elements(model, &free, turn);
         let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();
         let stiffness = window.points(model).map(|index| model.relative_anchor_stiffness_at(index)).collect();
         let mut patch = LinearPatch {
@@ -197,7 +197,7 @@ impl<'m> LinearPatch<'m> {
             weights,
             masses,
             stiffness,
-            bonds,
+            elements,
             inverses: Vec::new(),
             accuracy: Accuracy::EXACT,
             allowance: Allowance::default(),
@@ -218,7 +218,7 @@ impl<'m> LinearPatch<'m> {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         self.inverses.clear();
         self.inverses.extend(self.stiffness.iter().map(|part| DMat3::from_diagonal(DVec3::splat(own * part))));
-        self.bonds.linearise(&self.displacement_m, &mut self.inverses);
+        self.elements.linearise(&self.displacement_m, &mut self.inverses);
         if let Some(SharedPressure { areas_m2, pa_per_m3 }) = &self.pressure {
             for (block, area) in self.inverses.iter_mut().zip(areas_m2) {
                 *block += DMat3::from_cols(*area * area.x, *area * area.y, *area * area.z) * *pa_per_m3;
@@ -238,7 +238,7 @@ impl<'m> LinearPatch<'m> {
                 product[system] = own * part * x[system];
             }
         }
-        self.bonds.times(x, product);
+        self.elements.times(x, product);
         if let Some(pressure) = &self.pressure {
             for system in 0..N {
                 let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(x.iter().map(|x| &x[system]));
@@ -279,7 +279,7 @@ impl<'m> LinearPatch<'m> {
             if (0..N).all(|system| left[system] <= good * good * whole[system]) {
                 return (x, iteration);
             }
-            if !self.allowance.take(self.bonds.work()) {
+            if !self.allowance.take(self.elements.work()) {
                 return (x, iteration);
             }
             self.times(&direction, &mut product);
@@ -324,7 +324,7 @@ impl<'m> LinearPatch<'m> {
             stiffness_n_per_m,
             damping_n_s_per_m: scene.damping_n_s_per_m * unit,
             drag_n_s_per_m: scene.damping_n_s_per_m
-                * self.window.slopes(self.model, self.bonds.springs(), &self.masses, &self.displacement_m),
+                * self.window.slopes(self.model, self.elements.springs(), &self.masses, &self.displacement_m),
             mass_kg: scene.point_mass_kg() * unit.z_axis.z,
             iterations,
         }
@@ -342,7 +342,7 @@ impl<'m> LinearPatch<'m> {
                 .zip(&self.stiffness)
                 .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z])
                 .collect();
-            self.bonds.forces(|point, force_n| right[point][0] += force_n);
+            self.elements.forces(|point, force_n| right[point][0] += force_n);
             if let Some(pressure) = &self.pressure {
                 let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(self.displacement_m.iter());
                 for (right, area) in right.iter_mut().zip(&pressure.areas_m2) {

@@ -273,7 +273,7 @@ impl Region {
 }
 
 /// Largest number of inclusions in a scene.
-const MAX_INCLUSIONS: usize = 256;
+pub(super) const MAX_INCLUSIONS: usize = 256;
 
 /// Largest number of inclusions times vertices: each inclusion examines every vertex.
 const MAX_LOOKED_AT: usize = 8_000_000;
@@ -307,8 +307,8 @@ impl Inclusion {
         })
     }
 
-    /// Checks an inclusion; `field` is its key in refusals.
-    fn check(&self, field: &str, shape: &MeshShape) -> Result<()> {
+    /// Checks what does not depend on the tissue; `field` is the key of the inclusion in refusals.
+    pub(super) fn check_numbers(&self, field: &str) -> Result<()> {
         let named = |key: &str| format!("{field}.{key}");
         let factors =
             [("stiffness_factor", self.stiffness_factor), ("anchor_stiffness_factor", self.anchor_stiffness_factor)];
@@ -316,20 +316,28 @@ impl Inclusion {
             number(&named(key), factor, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))?;
         }
         not_negative(&named("edge_m"), self.edge_m)?;
+        if let Region::Ball { centre_m, radius_m } = &self.region {
+            finite_vector(&named("centre_m"), *centre_m)?;
+            positive(&named("radius_m"), *radius_m)?;
+        }
+        Ok(())
+    }
+
+    /// Checks an inclusion of a mesh; `field` is its key in refusals.
+    fn check(&self, field: &str, shape: &MeshShape) -> Result<()> {
+        self.check_numbers(field)?;
         match &self.region {
             Region::Ball { centre_m, radius_m } => {
-                finite_vector(&named("centre_m"), *centre_m)?;
-                positive(&named("radius_m"), *radius_m)?;
                 let nearest_m = shape.rest_m(shape.nearest(*centre_m));
                 let away_m = nearest_m.distance(*centre_m);
                 if away_m > radius_m + self.edge_m {
                     let message = format!(
                         "no vertex is within the ball: the nearest is at {nearest_m:.4} m, {away_m:.4} m from its centre"
                     );
-                    return Err(Refusal::new(Reason::OutOfRange, named("radius_m"), message));
+                    return Err(Refusal::new(Reason::OutOfRange, format!("{field}.radius_m"), message));
                 }
             }
-            Region::Group(name) => _ = group_named(&named("group"), name, &shape.told().groups)?,
+            Region::Group(name) => _ = group_named(&format!("{field}.group"), name, &shape.told().groups)?,
         }
         Ok(())
     }

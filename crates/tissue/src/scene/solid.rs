@@ -10,8 +10,8 @@ use std::sync::Arc;
 use palpate_geometry::TriangleMesh;
 use palpate_geometry::fill::Lattice;
 
-use super::body::{BodyKind, KindOfBody, StiffnessBound};
-use super::material::{Inclusion, Region};
+use super::body::{BodyKind, KindOfBody};
+use super::material::{Inclusion, MAX_INCLUSIONS, Region};
 use super::source::{Files, SourceMesh};
 use super::springs::Springs;
 use crate::limits::Limits;
@@ -25,8 +25,6 @@ mod shape;
 
 pub use fixed::FixedPart;
 pub use shape::{CellSize, SolidShape};
-
-use fixed::FixedParts;
 
 /// Smallest part of a cube that counts for stiffness and mass, if any of it is inside: a corner whose cubes were all
 /// slivers would have no mass.
@@ -112,9 +110,6 @@ pub struct Solid {
 }
 
 impl Solid {
-    /// Message of the refusal of a section that only surfaces have ([`Reason::WrongKind`]).
-    pub const HAS_AN_INSIDE: &str = "is for a mesh: a solid has an inside";
-
     /// Creates a solid that fills the surface of a mesh (m), without inclusions.
     ///
     /// # Errors
@@ -142,27 +137,25 @@ impl Solid {
     /// cubes of 2.5 to 5 mm: within 2 % of the truth; the arithmetic mean is 6 % too stiff.)
     ///
     /// # Errors
-    /// Refuses a group, a factor beyond 0.01 to 100, and a ball that reaches no cube; `field` is the key of the list.
+    /// Refuses more than 256 inclusions, a group, a factor beyond 0.01 to 100, and a ball that reaches no cube; `field` is
+    /// the key of the list.
     pub(super) fn with_inclusions(&self, inclusions: &[Inclusion], field: &str) -> Result<Self> {
+        if inclusions.len() > MAX_INCLUSIONS {
+            let message = format!("are {}, more than {MAX_INCLUSIONS}", inclusions.len());
+            return Err(Refusal::new(Reason::TooLarge, field, message));
+        }
         let mut solid = Solid::new(self.shape.clone(), self.material);
         let mut weights = solid.weights.to_vec();
         let mut factors = vec![1.0_f64; weights.len()];
-        for (number_of, inclusion) in inclusions.iter().enumerate() {
-            let field = format!("{field}[{number_of}]");
+        for (index, inclusion) in inclusions.iter().enumerate() {
+            let field = format!("{field}[{index}]");
             let Region::Ball { centre_m, radius_m } = inclusion.region else {
                 let message = "is for a mesh: an inclusion of a solid is a ball, with centre_m and radius_m";
                 return Err(Refusal::new(Reason::WrongKind, format!("{field}.group"), message));
             };
-            let named = |key: &str| format!("{field}.{key}");
-            palpate_refusal::finite_vector(&named("centre_m"), centre_m)?;
-            positive(&named("radius_m"), radius_m)?;
-            not_negative(&named("edge_m"), inclusion.edge_m)?;
-            number(&named("stiffness_factor"), inclusion.stiffness_factor, "from 0.01 to 100", |v| {
-                (0.01..=100.0).contains(&v)
-            })?;
-            let reached = self.shape.cells_within(centre_m, radius_m + inclusion.edge_m);
+            inclusion.check_numbers(&field)?;
             let mut reaches = false;
-            for cell in reached {
+            for cell in self.shape.cells_within(centre_m, radius_m + inclusion.edge_m) {
                 let at = self.shape.lattice().index(cell);
                 if weights[at] > 0.0 {
                     let part = inclusion.mean_part(self.shape.lattice(), cell, LOOKS);
@@ -172,7 +165,7 @@ impl Solid {
             }
             if !reaches {
                 let message = "reaches no part of the solid";
-                return Err(Refusal::new(Reason::OutOfRange, named("radius_m"), message));
+                return Err(Refusal::new(Reason::OutOfRange, format!("{field}.radius_m"), message));
             }
         }
         weights.iter_mut().zip(&factors).for_each(|(weight, factor)| *weight *= factor);
@@ -218,13 +211,13 @@ impl Solid {
             (None, None) => CellSize::USUAL,
         };
         let fixed = match fields.item("fixed") {
-            Some(item) => FixedParts::read(&item)?,
+            Some(item) => FixedPart::read_list(&item)?,
             None => {
                 let message = "is missing: which part does not move, as [{ plane_m, normal, within_m }]";
                 return Err(fields.refuse(Reason::Missing, "fixed", message));
             }
         };
-        let made = SolidShape::of(mesh, size, &fixed.parts, limits);
+        let made = SolidShape::of(mesh, size, &fixed, limits);
         made.map_err(|refusal| match refusal.field.as_str() {
             "" => source.refuse(refusal.reason, refusal.message),
             "cell_m" => cell.as_ref().or(cells.as_ref()).unwrap_or(&source).refuse(refusal.reason, refusal.message),
@@ -325,10 +318,6 @@ impl BodyKind for Solid {
 
     fn spring_bound_n_per_m(&self, springs: &Springs, _anchor_n_per_m: f64) -> f64 {
         springs.stiffness_n_per_m * self.bound()
-    }
-
-    fn fastest(&self) -> Option<StiffnessBound> {
-        None
     }
 
     fn warnings(&self) -> Vec<String> {

@@ -4,18 +4,18 @@
 //! empty places: they have no mass, and count as fixed, so they stay at 0.
 //!
 //! A cube with corners at rest X and displacements u has F = I + H at its middle, H = ∂u/∂X. It is stretched and sheared
-//! as F says ([`law`]), and resists the other ways in which eight corners can move (hourglasses) as the integral of
+//! as F says ([`neo_hookean`]), and resists the other ways in which eight corners can move (hourglasses) as the integral of
 //! μ|F|²/2 over the cube does. So one evaluation a cube suffices, and nothing locks.
 
 pub(crate) mod footprint;
-pub(crate) mod law;
-pub(crate) mod linear;
+pub(crate) mod linear_cells;
+pub(crate) mod neo_hookean;
 pub(crate) mod places;
 pub(crate) mod sweep;
 
 #[cfg(test)]
 mod tests;
 
-pub(crate) use law::CellLaw;
+pub(crate) use neo_hookean::NeoHookean;
 pub(crate) use places::SolidPlaces;
 pub(crate) use sweep::{SolidGrid, SolidSweep, SolidTables, gather};

@@ -10,7 +10,7 @@ use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::real::Real;
 use crate::memory;
 use crate::scene::profile::Poke;
-use crate::scene::{Solid, SolidShape};
+use crate::scene::{BodyKind, Solid, SolidShape};
 use crate::shape::{PointId, RestShape};
 
 /// Name of the tables in messages.
@@ -27,9 +27,6 @@ pub(crate) struct SolidPlaces {
     /// The relative mass of each place; 0 where there is no point.
     masses: Vec<f64>,
     pub(crate) largest_mass: f64,
-    /// The point at each place; 0 where there is none.
-    point_at: Vec<u32>,
-    place_of: Vec<u32>,
     pub(crate) links: TileLinks,
     /// μ/E and λ/E.
     lame_over_youngs: [f64; 2],
@@ -37,25 +34,17 @@ pub(crate) struct SolidPlaces {
 
 impl SolidPlaces {
     /// Lays out a solid.
-    #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn of(solid: &Solid) -> Self {
         let shape = solid.shape.clone();
-        let lattice = shape.lattice();
-        let corners = lattice.cells.map(|cells| cells + 1);
-        let count: usize = corners.iter().product();
+        let corners = shape.lattice().cells.map(|cells| cells + 1);
+        let count = shape.place_count();
         let mut weights = memory::zeroed(count, TABLES);
-        for (cell, weight) in solid.weights().iter().enumerate() {
-            let [x, y, _] = lattice.cells;
-            let [i, j, k] = [cell % x, cell / x % y, cell / x / y];
-            weights[(k * corners[1] + j) * corners[0] + i] = *weight;
+        for (cell, weight) in shape.cells().zip(solid.weights()) {
+            weights[shape.corner(cell)] = *weight;
         }
-        let (mut masses, mut point_at) = (memory::zeroed(count, TABLES), memory::zeroed(count, TABLES));
-        let points = crate::shape::points(&*shape);
-        let place_of: Vec<u32> = memory::collected(points.clone().map(|point| shape.corner_of(point) as u32), TABLES);
-        for point in points {
-            let place = shape.corner_of(point);
-            masses[place] = crate::scene::BodyKind::relative_mass(solid, point);
-            point_at[place] = point.index() as u32;
+        let mut masses = memory::zeroed(count, TABLES);
+        for point in crate::shape::points(&*shape) {
+            masses[shape.corner_of(point)] = solid.relative_mass(point);
         }
         let largest_mass = masses.iter().copied().fold(0.0, f64::max);
         let mut places = SolidPlaces {
@@ -64,8 +53,6 @@ impl SolidPlaces {
             weights,
             masses,
             largest_mass,
-            point_at,
-            place_of,
             links: TileLinks::default(),
             lame_over_youngs: [solid.material.shear_over_youngs(), solid.material.lame_over_youngs()],
         };
@@ -108,31 +95,22 @@ impl SolidPlaces {
     }
 
     pub(crate) fn place_of(&self, point: PointId) -> usize {
-        self.place_of[point.index()] as usize
+        self.shape.corner_of(point)
     }
 
     /// Returns the point at a place; the first point where there is none.
     pub(crate) fn point_at(&self, place: usize) -> PointId {
-        PointId::new(self.point_at[place] as usize)
+        self.shape.point_at_corner(place).unwrap_or(PointId::new(0))
     }
 
-    /// Returns the point at each place, and the place of each point.
+    /// Returns the point at each place (the number of none where there is none), and the place of each point.
     pub(crate) fn order(&self) -> [&[u32]; 2] {
-        [&self.point_at, &self.place_of]
+        self.shape.order()
     }
 
     /// Returns the rest position of a place, m.
     pub(crate) fn rest_m(&self, place: usize) -> DVec3 {
-        let lattice = self.shape.lattice();
-        #[allow(clippy::cast_precision_loss)]
-        let at = self.axes_of(place).map(|at| at as f64);
-        lattice.origin_m + lattice.edge_m * DVec3::from_array(at)
-    }
-
-    #[inline(always)]
-    fn axes_of(&self, place: usize) -> [usize; 3] {
-        let [x, y, _] = self.corners;
-        [place % x, place / x % y, place / x / y]
+        self.shape.corner_m(place)
     }
 
     /// Returns the places of the corners of the cube of which `cube` is the least corner: those farther along x after the
@@ -148,7 +126,7 @@ impl SolidPlaces {
     /// along y, one before along z, and both. `None` where there is no cube.
     #[inline(always)]
     pub(crate) fn cubes_around(&self, place: usize, beside: usize) -> [Option<usize>; 4] {
-        let [i, j, k] = self.axes_of(place);
+        let [i, j, k] = self.shape.corner_at(place);
         let [x, y, _] = self.corners;
         let mut cubes = [None; 4];
         for (row, cube) in cubes.iter_mut().enumerate() {

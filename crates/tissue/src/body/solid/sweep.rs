@@ -3,7 +3,7 @@
 //! Row (j, k) of cubes acts on the rows (j, k), (j + 1, k), (j, k + 1) and (j + 1, k + 1) of corners. What the sweep still
 //! needs of it waits: for (j + 1, k) in a row, for (j, k + 1) in a plane, for (j + 1, k + 1) in a row that the next row of
 //! cubes adds to the plane. When cube row (j, k) is done, all forces on corner row (j, k) are known and nothing reads its
-//! displacements again. All of it is kept as even and odd parts along x ([`law`](super::law)): the force on corner i is
+//! displacements again. All of it is kept as even and odd parts along x ([`neo_hookean`](super::neo_hookean)): the force on corner i is
 //!
 //! (odd − even) of cube i − (even + odd) of cube i − 1,  each the sum (plane + row) + own.
 //!
@@ -17,7 +17,7 @@
 use std::cell::RefCell;
 use std::ops::Range;
 
-use super::law::{CellLaw, Patterns};
+use super::neo_hookean::{NeoHookean, Patterns};
 use super::places::SolidPlaces;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::{Run, Scalar, Vector};
@@ -90,7 +90,7 @@ pub(crate) struct SolidGrid<'a, T> {
     pub(crate) layout: Layout,
     pub(crate) places: &'a SolidPlaces,
     pub(crate) tables: &'a SolidTables<T>,
-    pub(crate) law: &'a CellLaw<T>,
+    pub(crate) law: &'a NeoHookean<T>,
     /// Displacements: three planes, edges of cubes.
     pub(crate) x: *const T,
 }
@@ -227,7 +227,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
 #[inline(always)]
 pub(crate) fn gather<T: Real>(
     places: &SolidPlaces,
-    law: &CellLaw<T>,
+    law: &NeoHookean<T>,
     layout: &Layout,
     u: &[T],
     place: usize,

@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
-use super::law::{CellLaw, Patterns};
-use super::linear::LinearCells;
+use super::linear_cells::LinearCells;
+use super::neo_hookean::{NeoHookean, Patterns};
 use crate::body::Places;
 use crate::body::model::{Model, Plan};
 use crate::body::tables::{SweepTables, springs_of};
@@ -37,7 +37,7 @@ fn patterns(corners: &Corners) -> Patterns<Scalar<f64>> {
 
 fn forces(corners: &Corners) -> Corners {
     let patterns = patterns(corners);
-    let stress = CellLaw::new(1.0, SHEAR, LAME).stress(Scalar(0.7), &patterns);
+    let stress = NeoHookean::new(1.0, SHEAR, LAME).stress(Scalar(0.7), &patterns);
     let found = [0, 1, 2].map(|c| stress.on_rows(&patterns, c));
     std::array::from_fn(|corner| {
         let of = |c: usize| {
@@ -50,7 +50,7 @@ fn forces(corners: &Corners) -> Corners {
 }
 
 fn energy(corners: &Corners) -> f64 {
-    CellLaw::new(1.0, SHEAR, LAME).energy(Scalar(0.7), &patterns(corners)).0
+    NeoHookean::new(1.0, SHEAR, LAME).energy(Scalar(0.7), &patterns(corners)).0
 }
 
 /// The corners at rest, in edges.

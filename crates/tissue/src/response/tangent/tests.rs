@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::DVec2;
 
 use super::*;
-use crate::body::bonds::Spring;
+use crate::body::elements::Spring;
 use crate::body::window::{REACHES, half_window_m};
 use crate::limits::Limits;
 use crate::scene::Scene;
@@ -72,7 +72,7 @@ fn the_linearised_springs_have_the_springs_forces_and_their_derivative() {
     let patch = patch(&model, 1.0, stretched(spacing_m));
     let mut found: Vec<DVec3> =
         patch.displacement_m.iter().map(|u| -model.scene.anchor_stiffness_n_per_m * *u).collect();
-    for Spring { ends: [a, b], force_n, .. } in patch.bonds.springs() {
+    for Spring { ends: [a, b], force_n, .. } in patch.elements.springs() {
         found[*a] += *force_n;
         found[*b] -= *force_n;
     }

@@ -52,6 +52,23 @@ impl FixedPart {
         Ok(FixedPart::Ball { centre_m, radius_m: positive("radius_m", radius_m)? })
     }
 
+    /// Reads `solid.fixed`, one part or a list of parts.
+    ///
+    /// # Errors
+    /// Refuses a text, a part that is neither a plane nor a ball, and numbers out of their range.
+    pub(super) fn read_list(item: &Item<'_>) -> Result<Vec<Self>> {
+        if item.as_text().is_some() {
+            return Err(item.wrong(
+                "a list of planes { plane_m, normal, within_m }, balls { centre_m, radius_m } and groups { group }",
+            ));
+        }
+        let Ok(items) = item.list() else { return Ok(vec![read_part(item)?]) };
+        if items.is_empty() {
+            return Err(item.refuse(Reason::Missing, "names no part: without one, nothing would hold the solid"));
+        }
+        items.iter().map(read_part).collect()
+    }
+
     /// Returns whether a point of a lattice is in the part; false for a group, which has points of its own.
     pub(super) fn holds(&self, lattice: &Lattice, place_m: DVec3) -> bool {
         match *self {
@@ -74,30 +91,6 @@ impl FixedPart {
 /// Returns the axis that a unit vector is along, if it is along one.
 pub(super) fn along_axis(normal: DVec3) -> Option<usize> {
     (0..3).find(|axis| normal[*axis].abs() > 1.0 - 1e-9)
-}
-
-/// `solid.fixed` as a scene has it.
-pub(super) struct FixedParts {
-    pub(super) parts: Vec<FixedPart>,
-}
-
-impl FixedParts {
-    /// Reads one part or a list of parts.
-    ///
-    /// # Errors
-    /// Refuses a text, a part that is neither a plane nor a ball, and numbers out of their range.
-    pub(super) fn read(item: &Item<'_>) -> Result<Self> {
-        if item.as_text().is_some() {
-            return Err(item.wrong(
-                "a list of planes { plane_m, normal, within_m }, balls { centre_m, radius_m } and groups { group }",
-            ));
-        }
-        let Ok(items) = item.list() else { return Ok(FixedParts { parts: vec![read_part(item)?] }) };
-        if items.is_empty() {
-            return Err(item.refuse(Reason::Missing, "names no part: without one, nothing would hold the solid"));
-        }
-        Ok(FixedParts { parts: items.iter().map(read_part).collect::<Result<_>>()? })
-    }
 }
 
 fn read_part(item: &Item<'_>) -> Result<FixedPart> {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_geometry::fill::{Lattice, filled};
 use palpate_geometry::subdivide::subdivide;
-use palpate_geometry::{Group, TriangleMesh};
+use palpate_geometry::{Group, TriangleMesh, report};
 
 use super::fixed::{FixedPart, along_axis};
 use crate::limits::Limits;
@@ -260,19 +260,32 @@ impl SolidShape {
         self.point_at_corner(self.corner(corner))
     }
 
+    /// Returns the rest position of the corner of a number, m.
+    pub(crate) fn corner_m(&self, number: usize) -> DVec3 {
+        let corner = self.corner_at(number).map(|at| at as f64);
+        self.lattice.origin_m + self.lattice.edge_m * DVec3::from_array(corner)
+    }
+
+    /// Returns the point at each corner (the number of none where there is none), and the corner of each point.
+    pub(crate) fn order(&self) -> [&[u32]; 2] {
+        [&self.point_of, &self.corner_of]
+    }
+
     /// Returns the number of a corner.
-    fn corner(&self, [i, j, k]: [usize; 3]) -> usize {
+    pub(crate) fn corner(&self, [i, j, k]: [usize; 3]) -> usize {
         let [x, y, _] = self.lattice.cells.map(|cells| cells + 1);
         (k * y + j) * x + i
     }
 
     /// Returns the corner of a number.
-    fn corner_at(&self, number: usize) -> [usize; 3] {
+    #[inline(always)]
+    pub(crate) fn corner_at(&self, number: usize) -> [usize; 3] {
         let [x, y, _] = self.lattice.cells.map(|cells| cells + 1);
         [number % x, number / x % y, number / x / y]
     }
 
-    fn cells(&self) -> impl Iterator<Item = [usize; 3]> + use<> {
+    /// Returns the cubes, in the order of [`Lattice::index`].
+    pub(crate) fn cells(&self) -> impl Iterator<Item = [usize; 3]> + use<> {
         let [x, y, z] = self.lattice.cells;
         (0..x * y * z).map(move |cell| [cell % x, cell / x % y, cell / x / y])
     }
@@ -362,11 +375,7 @@ fn edge_for(mesh: &TriangleMesh, count: f64) -> Result<f64> {
     if count < 1.0 {
         return Err(Refusal::new(Reason::OutOfRange, "cell_m", "must be at least 1"));
     }
-    let volume = |[a, b, c]: [u32; 3]| {
-        let [a, b, c] = [a, b, c].map(|vertex| mesh.vertices_m[vertex as usize]);
-        a.dot(b.cross(c)) / 6.0
-    };
-    let volume_m3 = mesh.triangles.iter().map(|triangle| volume(*triangle)).sum::<f64>().abs();
+    let volume_m3 = report::volume(&mesh.vertices_m, &mesh.triangles).abs();
     let edge_m = (volume_m3 / count).cbrt();
     if edge_m > 0.0 { Ok(edge_m) } else { Err(Refusal::new(Reason::Unreadable, "", "encloses no volume")) }
 }
@@ -423,8 +432,7 @@ impl RestShape for SolidShape {
     }
 
     fn rest_m(&self, point: PointId) -> DVec3 {
-        let corner = self.corner_at(self.corner_of(point)).map(|at| at as f64);
-        self.lattice.origin_m + self.lattice.edge_m * DVec3::from_array(corner)
+        self.corner_m(self.corner_of(point))
     }
 
     /// Returns the normal of the nearest vertex of the surface.

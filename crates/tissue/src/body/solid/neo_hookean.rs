@@ -38,7 +38,7 @@ const LARGEST: f64 = 5.0;
 
 /// Coefficients of a material's cubes, in units of a scheme.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct CellLaw<T> {
+pub(crate) struct NeoHookean<T> {
     /// c·μ/E, where c is k/64 times the factor to the scheme's units of force.
     shear: T,
     /// c·(λ + μ)/E/4, the factor of 64(J − 1) in 16 times the pressure.
@@ -119,12 +119,12 @@ impl<V: Vector> Stress<V> {
     }
 }
 
-impl<T: Real> CellLaw<T> {
+impl<T: Real> NeoHookean<T> {
     /// Creates the law of a material with μ/E = `shear` and λ/E = `lame`. `stiffness` is k = E·a times the factor to the
     /// scheme's units of force.
     pub(crate) fn new(stiffness: f64, shear: f64, lame: f64) -> Self {
         let unit = stiffness / 64.0;
-        CellLaw { shear: T::of(unit * shear), bulk: T::of(unit * (lame + shear) / 4.0) }
+        NeoHookean { shear: T::of(unit * shear), bulk: T::of(unit * (lame + shear) / 4.0) }
     }
 
     /// Returns what cubes of weight `w` pull with.
@@ -150,7 +150,7 @@ impl<T: Real> CellLaw<T> {
         Stress::of(p, shear)
     }
 
-    /// Returns the energy of cubes, in the scheme's units of force times edges: that of [`CellLaw::stress`], with the
+    /// Returns the energy of cubes, in the scheme's units of force times edges: that of [`NeoHookean::stress`], with the
     /// reduced pressure.
     #[inline(always)]
     pub(crate) fn energy<V: Vector<Real = T>>(&self, w: V, Patterns { h, g }: &Patterns<V>) -> V {

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 
-use crate::body::solid::linear::LinearCells;
+use crate::body::solid::linear_cells::LinearCells;
 
 /// A spring of the part, linearised at the present displacements.
 #[derive(Debug, Clone, Copy)]
@@ -23,33 +23,33 @@ impl Spring {
 
 /// What joins the points of a part of a tissue.
 #[derive(Debug)]
-pub(crate) enum Bonds {
+pub(crate) enum Elements {
     /// Springs.
     Springs(Vec<Spring>),
     /// Cubes.
     Cells(LinearCells),
 }
 
-impl Bonds {
+impl Elements {
     /// Returns the work of one multiplication, in springs. (A cube takes as long as ten.)
     pub(crate) fn work(&self) -> usize {
         match self {
-            Bonds::Springs(springs) => springs.len(),
-            Bonds::Cells(cells) => 10 * cells.len(),
+            Elements::Springs(springs) => springs.len(),
+            Elements::Cells(cells) => 10 * cells.len(),
         }
     }
 
     /// Returns the springs; none in a solid.
     pub(crate) fn springs(&self) -> &[Spring] {
-        if let Bonds::Springs(springs) = self { springs } else { &[] }
+        if let Elements::Springs(springs) = self { springs } else { &[] }
     }
 
     /// Computes forces and their derivatives at the present displacements of the points, m. Adds to `blocks` the
     /// stiffness that holds each point if the others are held.
     pub(crate) fn linearise(&mut self, displacement_m: &[DVec3], blocks: &mut [DMat3]) {
         let springs = match self {
-            Bonds::Springs(springs) => springs,
-            Bonds::Cells(cells) => return cells.linearise(displacement_m, blocks),
+            Elements::Springs(springs) => springs,
+            Elements::Cells(cells) => return cells.linearise(displacement_m, blocks),
         };
         for spring in springs {
             let [a, b] = spring.ends;
@@ -71,24 +71,24 @@ impl Bonds {
     }
 
     /// Calls `add` with points and forces on them, N: all together are those at the displacements of
-    /// [`Bonds::linearise`].
+    /// [`Elements::linearise`].
     pub(crate) fn forces(&self, mut add: impl FnMut(usize, DVec3)) {
         match self {
-            Bonds::Springs(springs) => {
+            Elements::Springs(springs) => {
                 for spring in springs {
                     add(spring.ends[0], spring.force_n);
                     add(spring.ends[1], -spring.force_n);
                 }
             }
-            Bonds::Cells(cells) => cells.forces(add),
+            Elements::Cells(cells) => cells.forces(add),
         }
     }
 
     /// Adds K·x for `N` vectors at once to `product`.
     pub(crate) fn times<const N: usize>(&self, x: &[[DVec3; N]], product: &mut [[DVec3; N]]) {
         let springs = match self {
-            Bonds::Springs(springs) => springs,
-            Bonds::Cells(cells) => return cells.times(x, product),
+            Elements::Springs(springs) => springs,
+            Elements::Cells(cells) => return cells.times(x, product),
         };
         for Spring { ends: [a, b], tangent, .. } in springs {
             for system in 0..N {

@@ -1,7 +1,7 @@
 //! The cubes of a part of a solid, linearised at given displacements: what a slow press needs (`response::tangent`).
 //!
 //! With C = 16 cof F, 16 P = 4μ·h + q·C + 16μ·I, and so d(16 P) = 4μ·dh + dq·C + q·dC with dq = (λ + μ)·(C : dh)/64. The
-//! reduction of the pressure ([`law`](super::law)) is left out of the derivative, not of the force: Newton's method finds
+//! reduction of the pressure ([`neo_hookean`](super::neo_hookean)) is left out of the derivative, not of the force: Newton's method finds
 //! the same place, in a step more.
 #![allow(clippy::needless_range_loop)]
 
@@ -9,7 +9,7 @@ use std::cell::RefCell;
 
 use glam::{DMat3, DVec3};
 
-use super::law::{CellLaw, Patterns, Stress, invariants};
+use super::neo_hookean::{NeoHookean, Patterns, Stress, invariants};
 use super::places::SolidPlaces;
 use crate::kernel::lanes::{self, Scalar, SingleWork};
 
@@ -125,7 +125,7 @@ impl LinearCells {
     fn evaluate(&mut self, displacement_m: &[DVec3]) {
         let LinearCells { cells, turn, edge_m, stiffness_n_per_m, shear, lame } = self;
         let back = turn.transpose();
-        let law = CellLaw::<f64>::new(*stiffness_n_per_m * *edge_m, *shear, *lame);
+        let law = NeoHookean::<f64>::new(*stiffness_n_per_m * *edge_m, *shear, *lame);
         for cell in cells {
             let corners = cell.points.map(|point| {
                 let moved_m = if point == BEYOND { DVec3::ZERO } else { displacement_m[point as usize] };
