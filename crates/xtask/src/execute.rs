@@ -53,10 +53,6 @@ pub(crate) fn execute(stages: &[PlanStage]) -> Result<(), TaskFailure> {
                 }
                 ended?;
             }
-            PlanStage::Together { step, others } => {
-                let (ended, beside) = run_with(step, others);
-                ended.and(beside)?;
-            }
             PlanStage::Mark(file) => {
                 std::fs::write(file, "")
                     .map_err(|error| TaskFailure::Failed(format!("can't write {file}: {error}")))?;
@@ -92,7 +88,7 @@ pub(crate) fn command(step: &Step) -> Result<Command, TaskFailure> {
             command.env_remove(key);
         }
     }
-    if let Some((name, value)) = step.variable {
+    for (name, value) in &step.variables {
         command.env(name, value);
     }
     if let Some(folder) = &step.path {

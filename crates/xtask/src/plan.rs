@@ -11,8 +11,8 @@ pub(crate) struct Step {
     pub(crate) arguments: Vec<String>,
     /// The folder in which it runs, below that of the sources; empty for that folder itself.
     pub(crate) folder: &'static str,
-    /// A variable of its environment.
-    pub(crate) variable: Option<(&'static str, &'static str)>,
+    /// Variables of its environment.
+    pub(crate) variables: Vec<(&'static str, String)>,
     /// A folder whose programs it finds before others of the same name.
     pub(crate) path: Option<String>,
 }
@@ -24,8 +24,6 @@ pub(crate) enum PlanStage {
     Step(Step),
     /// A command, and others at the same time that may fail. If one does, the rest of them do not run, and this text is printed.
     Beside { step: Step, others: Vec<Step>, without: &'static str },
-    /// A command, and others one after another at the same time. The plan ends when all have ended, if one fails.
-    Together { step: Step, others: Vec<Step> },
     /// Writes an empty file, which says that the stages before it are done.
     Mark(&'static str),
     /// Prints what is left out, and why.
@@ -38,6 +36,9 @@ const WITHOUT_PAGE: &str = "So there is no page to look at; gRPC is served all t
 
 /// The same random cases every time, so that the result is that of the change.
 const SEED: (&str, &str) = ("PROPTEST_RNG_SEED", "20261122");
+
+/// Tests of a program that run at once on each core: those of a running server wait for half of their time.
+const TESTS_PER_CORE: usize = 3;
 
 fn step(program: &str, arguments: &[&str]) -> Step {
     Step {
@@ -142,27 +143,19 @@ impl System {
             self.need_python()?;
             stages.extend(self.venv());
         }
-        let mut others = Vec::new();
         for (_, part) in PARTS.into_iter().filter(|(_, part)| is_asked(*part)) {
             match part {
                 TestPart::Viewer => {
                     self.need_node()?;
-                    others.extend(self.page());
-                    others.extend(["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"])));
+                    let tests = ["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"]));
+                    stages.extend(self.page().into_iter().chain(tests).map(PlanStage::Step));
                 }
                 // The tools for building are those of the environment, so that pip makes none of its own; what is compiled is
                 // what the first stage has compiled.
                 TestPart::Python => {
                     let install = ["--no-build-isolation", "--no-deps", "--force-reinstall", "./clients/python"];
-                    others.push(Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) });
-                    others.push(self.unittest("clients/python/tests"));
-                }
-                // The tests of Rust compile for minutes, which those before need not wait for. They run alone: some serve in
-                // real time.
-                TestPart::Rust if !others.is_empty() => {
-                    let compile = self.cargo(&["test", "--release", "--workspace", "--no-run"]);
-                    stages.push(PlanStage::Together { step: compile, others: std::mem::take(&mut others) });
-                    stages.push(self.rust_tests());
+                    let install = Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) };
+                    stages.extend([install, self.unittest("clients/python/tests")].map(PlanStage::Step));
                 }
                 TestPart::Protocol => {
                     let format = Step { folder: "proto/generator", ..self.cargo(&["fmt", "--check"]) };
@@ -184,17 +177,14 @@ impl System {
                 }
                 TestPart::Documents => stages.push(PlanStage::Step(self.unittest("tests/python"))),
             }
-            // Without the tests of Rust, each runs alone.
-            if !is_asked(TestPart::Rust) {
-                stages.extend(others.drain(..).map(PlanStage::Step));
-            }
         }
         Ok(stages)
     }
 
     fn rust_tests(&self) -> PlanStage {
         let test = self.cargo(&["test", "--release", "--workspace", "--no-fail-fast"]);
-        PlanStage::Step(Step { variable: Some(SEED), ..test })
+        let threads = ("RUST_TEST_THREADS", (TESTS_PER_CORE * self.cores).to_string());
+        PlanStage::Step(Step { variables: vec![(SEED.0, SEED.1.to_owned()), threads], ..test })
     }
 
     fn pip(&self, arguments: &[&str]) -> Step {
@@ -240,10 +230,6 @@ pub(crate) fn shown(stages: &[PlanStage]) -> String {
                 add(step.to_string());
                 others.iter().for_each(|other| add(format!("{other}   # at the same time; may fail")));
             }
-            PlanStage::Together { step, others } => {
-                add(step.to_string());
-                others.iter().for_each(|other| add(format!("{other}   # at the same time")));
-            }
             PlanStage::Mark(file) => add(format!("# marks {file}")),
             PlanStage::Note(text) => add(format!("# {text}")),
             PlanStage::Serve { server, poke } => {
@@ -260,7 +246,7 @@ impl std::fmt::Display for Step {
         if !self.folder.is_empty() {
             write!(f, "(in {}) ", self.folder)?;
         }
-        if let Some((name, value)) = self.variable {
+        for (name, value) in &self.variables {
             write!(f, "{name}={value} ")?;
         }
         write!(f, "{}", self.program)?;
@@ -283,6 +269,7 @@ mod tests {
             has_python: true,
             has_node: true,
             has_shell: !is_windows,
+            cores: 2,
             target: "target".to_owned(),
             has_modules: false,
             has_page: false,
@@ -344,13 +331,12 @@ mod tests {
                 WORKSPACE,
                 "(in proto/generator) cargo fmt --check",
                 "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator",
-                "cargo test --release --workspace --no-run",
-                "(in clients/viewer) npm test   # at the same time",
-                "(in clients/typescript) npm test   # at the same time",
+                "(in clients/viewer) npm test",
+                "(in clients/typescript) npm test",
                 "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
-                 --force-reinstall ./clients/python   # at the same time",
-                "target/venv/bin/python -m unittest discover -s clients/python/tests -v   # at the same time",
-                "PROPTEST_RNG_SEED=20261122 cargo test --release --workspace --no-fail-fast",
+                 --force-reinstall ./clients/python",
+                "target/venv/bin/python -m unittest discover -s clients/python/tests -v",
+                "PROPTEST_RNG_SEED=20261122 RUST_TEST_THREADS=6 cargo test --release --workspace --no-fail-fast",
                 "sh tests/abi/check.sh target/release interface",
                 "target/venv/bin/python -m unittest discover -s tests/python -v",
             ]
@@ -364,13 +350,6 @@ mod tests {
                 "{windows}: {unix}"
             );
         }
-    }
-
-    #[test]
-    fn without_the_tests_of_rust_each_part_runs_alone() {
-        let lines = lines(&ProjectTask::Test(vec![TestPart::Viewer, TestPart::Python]), &built(false));
-        assert_eq!(lines.len(), 5, "{lines:?}");
-        assert!(lines.iter().all(|line| !line.contains("at the same time")), "{lines:?}");
     }
 
     #[test]

@@ -23,6 +23,8 @@ pub(crate) struct System {
     pub(crate) has_node: bool,
     /// Whether `sh` is there.
     pub(crate) has_shell: bool,
+    /// Number of cores.
+    pub(crate) cores: usize,
     /// The folder of compiled files.
     pub(crate) target: String,
     /// Whether these are newer than what they are made from.
@@ -58,6 +60,7 @@ impl System {
             node,
             // The file without an ending is a shell script there.
             npm: named("NPM", if is_windows { "npm.cmd" } else { "npm" }),
+            cores: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
             target: named("CARGO_TARGET_DIR", "target"),
             has_modules: is_newer("clients/node_modules/.package-lock.json", &["clients/package-lock.json"]),
             has_page: is_newer("clients/viewer/dist/index.html", &PAGE_SOURCES),
