@@ -17,7 +17,7 @@ XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 PACKAGES := deb wheel npm crates library image helm unity unreal
 
 .PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
-	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-solid bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python chaos site
 
 help:
@@ -71,6 +71,7 @@ help:
 	@echo 'make bench-mesh      the time of a step on meshes, at every width, with numba, Taichi and a plain loop:'
 	@echo '                     docs/benchmarks/mesh.md'
 	@echo 'make bench-organ     organs: time of a step, sleep, tips, and evenness of touch: docs/benchmarks/organ.md'
+	@echo 'make bench-solid     solids: time of a substep, touch against other methods: docs/benchmarks/solid.md'
 	@echo 'make bench-python    a run in Python compared with the program, and a study of 1000 tissues with numba and NumPy'
 	@echo 'make bench-load      number of sessions on one core, with clients and without: docs/benchmarks/load.md'
 	@echo '                     ATTACK=all: the effect of 59 attacks on a client (half an hour): docs/benchmarks/attacks.md;'
@@ -224,7 +225,7 @@ bench-frames: need-rust
 # Ten thousand random scenes, as many that are merely legal, a soak of ten million steps, a thousand thin meshes under tips
 # (`PALPATE_STRESS_THIN=10000` takes hours), and five thousand snapshots that are restored.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 $(CARGO) test --release \
+	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_SOLIDS=1000 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 $(CARGO) test --release \
 		--test stress --test legal --test physics --test thin --test restored -- --include-ignored --nocapture
 
 # The unit tests of the tissue, and the golden hashes.
@@ -342,6 +343,9 @@ bench-mesh: need-rust $(PEERS)/ready
 
 bench-organ: need-rust
 	$(CARGO) bench --quiet --bench organ -- $(ARGUMENTS)
+
+bench-solid: need-rust
+	$(CARGO) bench --quiet --bench solid -- $(ARGUMENTS)
 
 bench-tick: need-rust
 	$(CARGO) bench --quiet --package palpate-client --bench tick

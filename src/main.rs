@@ -21,10 +21,12 @@ struct ServerArguments {
 
 #[derive(Subcommand)]
 enum ServerCommand {
-    /// Play a script on a scene, offline and as fast as possible; write the records as JSON Lines
+    /// Play a script on a scene, offline and as fast as possible, and write the records as JSON Lines; or indent the
+    /// tissue, and print force over depth
     #[command(after_help = "Examples:\n  \
         palpate run paper vertical-60\n  \
         palpate run liver press --output press.jsonl --plot\n  \
+        palpate run prostate indent --depth-mm 2 --output curve.csv\n  \
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),
@@ -77,7 +79,8 @@ enum ServerCommand {
         result of --repair or --vertices is not as requested: more than 1 % of area or volume lost, a closed surface \
         open, still refused, too many vertices; 2 when the mesh was refused.")]
     Mesh(mesh::MeshArguments),
-    /// Make the mesh of an organ: gallbladder, liver, kidney, stomach, a segment of colon, or a patch with lumps
+    /// Make the mesh of an organ: gallbladder, liver, kidney, stomach, prostate, a segment of colon, a patch with lumps,
+    /// or a phantom
     #[command(after_help = "Examples:\n  \
         palpate organ --list\n  \
         palpate organ gallbladder --output gallbladder.obj\n  \

@@ -7,11 +7,15 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_geometry::ReadLimits;
 use palpate_haptics::Tip;
 use palpate_refusal::Reason;
+use palpate_session::indentation::Indentation;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::response::mesh_error::MeshError;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::{Change, Scene};
+use palpate_tissue::scene::{CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
 
 /// A block of 60 × 60 × 30 mm that is held below, of a tissue of 8 kPa.
@@ -154,6 +158,74 @@ fn a_solid_that_is_pressed_far_too_deep_comes_back() {
     tissue.release(0);
     (0..3000).for_each(|_| tissue.step().unwrap());
     assert!(tissue.largest_displacement_m() < 1e-5, "{}", tissue.largest_displacement_m());
+}
+
+/// 107.37 N/m is the truth ([`a_disc_meets_the_stiffness_of_the_block_the_nearer_the_smaller_the_cubes`]).
+#[test]
+fn the_error_of_the_cubes_is_estimated_within_a_factor_of_two() {
+    for cell_m in ["0.006", "0.005", "0.00375"] {
+        let model = block(&format!("cell_m = {cell_m}"), &[]);
+        let disc = Disc { radius_m: 0.005, at_m: DVec3::new(0.03, 0.03, 0.03) };
+        let estimate = MeshError::of(&model, disc).unwrap();
+        let truth = estimate.stiffness_n_per_m / 107.37 - 1.0;
+        println!("{cell_m}: {estimate:?}, {truth}");
+        assert!((0.5..2.0).contains(&(estimate.relative / truth)), "{cell_m}: {estimate:?}, {truth}");
+    }
+    assert_eq!(
+        MeshError::of(
+            &common::model(&common::scene_with(common::SMALL, &[])),
+            Disc { radius_m: 0.1, at_m: DVec3::ZERO }
+        ),
+        None
+    );
+}
+
+#[test]
+fn an_indentation_goes_in_and_comes_back_on_one_curve() {
+    let model = block("cell_m = 0.006", &["material.damping_per_s=20"]);
+    let indentation = Indentation { place_m: None, radius_m: 0.005, depth_m: 1e-3, speed_m_per_s: 0.002 };
+    let indented = indentation.run(&model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();
+    let [first, .., last] = &indented.curve[..] else { panic!() };
+    assert!(indented.curve.len() == 21 && first.depth_m == 0.0 && (last.depth_m - 1e-3).abs() < 1e-6, "{last:?}");
+    assert!((indented.place_m - DVec3::new(0.03, 0.03, 0.03)).length() < 1e-3, "{}", indented.place_m);
+    for row in &indented.curve {
+        assert!((row.loading_n - row.unloading_n).abs() < 0.01 * last.loading_n, "{row:?}");
+    }
+    assert!(indented.curve.is_sorted_by(|a, b| a.loading_n < b.loading_n), "{:?}", indented.curve);
+    // The truth is 107.37 N/m, and cubes of 6 mm are a tenth too stiff.
+    assert!((105.0..130.0).contains(&indented.stiffness_n_per_m), "{}", indented.stiffness_n_per_m);
+    assert!(indented.summary.mesh_error_estimate.is_some_and(|error| error > 0.05 && error < 0.3));
+}
+
+/// Doubled and turned triangles, triangles on an edge of two others, and a second block that crosses the first.
+#[test]
+fn triangles_that_form_no_surface_are_filled_as_if_they_did() {
+    let mesh = |name: &str| {
+        palpate_geometry::read(name, &bytes(name), "mm".parse().unwrap(), &|_| None, &ReadLimits::default())
+    };
+    let whole = mesh("block.obj").unwrap().mesh;
+    let mut bad = whole.clone();
+    let first = bad.triangles[0];
+    bad.triangles.push(first);
+    bad.triangles.push([first[0], first[1], bad.triangles[5][2]]);
+    bad.triangles[3].swap(0, 1);
+    let corners = bad.vertices_m.len() as u32;
+    bad.vertices_m.extend(whole.vertices_m.iter().map(|at| *at * 0.5 + DVec3::new(0.041, 0.013, 0.007)));
+    bad.triangles.extend(whole.triangles.iter().map(|triangle| triangle.map(|corner| corner + corners)));
+    let fixed = FixedPart::Plane { plane_m: DVec3::ZERO, normal: DVec3::Z, within_m: 0.0 };
+    let of =
+        |mesh| Solid::of(mesh, CellSize::Edge(0.004), std::slice::from_ref(&fixed), SolidMaterial::usual()).unwrap();
+    let solid = of(bad);
+    let volume_m3 =
+        |solid: &Solid| solid.shape.parts().iter().map(|part| f64::from(*part)).sum::<f64>() * 0.004_f64.powi(3);
+    // Of the second block, x from 60 to 71 mm is outside of the first.
+    let expected = 0.06 * 0.06 * 0.03 + 0.011 * 0.03 * 0.015;
+    assert!((volume_m3(&solid) / expected - 1.0).abs() < 0.02, "{} {expected}", volume_m3(&solid));
+    assert!(solid.shape.surface().vertices_m().len() > 100);
+}
+
+fn bytes(name: &str) -> Vec<u8> {
+    std::fs::read(format!("{}/tests/reference/{name}", env!("CARGO_MANIFEST_DIR"))).unwrap()
 }
 
 #[test]

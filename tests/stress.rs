@@ -2,18 +2,19 @@
 //! panic.
 //!
 //! Fifty in every test run; `make stress` does ten thousand (`PALPATE_STRESS_SCENES`) and a soak of 10⁷ steps. Of closed
-//! meshes of a random material there are 4 for 250 steps each, and 200 for 5,000 (`PALPATE_STRESS_MESHES`).
+//! meshes of a random material there are 4 for 250 steps each, and 200 for 5,000 (`PALPATE_STRESS_MESHES`); of solids 4, and
+//! 1,000 (`PALPATE_STRESS_SOLIDS`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/cases.rs"]
 mod cases;
-#[path = "common/closed_mesh.rs"]
-mod closed_mesh;
 mod common;
+#[path = "common/random_scenes.rs"]
+mod random_scenes;
 
-use closed_mesh::closed_mesh;
 use common::{SMALL, model, scene_with};
 use glam::DVec3;
+use palpate_haptics::Tip;
 use palpate_tissue::guard::INTERVAL_SUBSTEPS;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
@@ -21,6 +22,8 @@ use palpate_tissue::scene::{Integrator, Named, Scene};
 use palpate_tissue::{self as tissue, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use random_scenes::closed_mesh::closed_mesh;
+use random_scenes::solid_case;
 
 /// Bound on the excess of the energy over the work of all tools, as a fraction of the largest energy so far and of all
 /// work: the margin of the guard, which checks every 256 substeps, and the error of estimating the work of held
@@ -255,6 +258,90 @@ fn closed_meshes_of_any_material_stay_finite() {
         }
     }
     assert!(2 * played >= meshes, "{played} of {meshes} were played");
+}
+
+/// Steps a tissue; after a blow-up it goes on from its last sound state, as in a session. Returns whether that was so.
+fn recovers(tissue: &mut dyn Tissue) -> bool {
+    let Err(blow_up) = tissue.step() else { return false };
+    tissue.recover(blow_up.step, false);
+    true
+}
+
+/// Tips that jump through random solids, up to 80 % deep, at any place and speed; forces a hundred times those of a hand;
+/// lumps up to 100 times as stiff. Everything stays finite, and afterwards the solid comes back to rest.
+#[test]
+fn abused_solids_stay_finite_and_come_back_to_rest() {
+    let from = cases::count("PALPATE_STRESS_SOLIDS_FROM", 0_u64, 0);
+    let solids = cases::count("PALPATE_STRESS_SOLIDS", 4, 100);
+    let (mut played, mut guarded, mut recovered) = (0, 0, 0);
+    for seed in from..from + solids {
+        let mut case = solid_case(seed);
+        let dice = &mut fastrand::Rng::with_seed(seed);
+        case.scene += &format!(
+            "[[inclusion]]\ncentre_m = [0, 0, 0]\nradius_m = 0.01\nstiffness_factor = {:e}\n",
+            10_f64.powf(2.0 * dice.f64())
+        );
+        let limits = Limits { substeps: 400, ..Limits::default() };
+        let sets = ["stepping.tolerance=1e-2".to_owned(), "material.damping_per_s=30".to_owned()];
+        let Ok(scene) = random_scenes::scene(&case, &sets, &limits) else { continue };
+        let Ok(model) = Model::compile(&scene, &limits) else { continue };
+        let mut tissue = tissue::at_rest(&model);
+        let (shape, cell_m) = (scene.shape(), scene.shape().edge_m());
+        let (size_m, middle_m) = (shape.extent().size_m(), shape.extent().middle_m());
+        let hand_n = 0.2 * scene.springs.stiffness_n_per_m * cell_m;
+        played += 1;
+        for step in 0..300 {
+            if step % 15 == 0 {
+                let tool = dice.usize(0..3);
+                let mut within = || 2.0 * dice.f64() - 1.0;
+                let (side, towards) = (DVec3::new(within(), within(), 1.0), DVec3::new(within(), within(), within()));
+                match dice.u8(0..5) {
+                    0 => tissue.release(tool),
+                    1 | 2 => {
+                        // From the surface to a fifth of the height.
+                        let at = DVec3::new(0.4, 0.4, 0.5 - 0.8 * dice.f64()) * side * size_m;
+                        tissue.pose(
+                            tool,
+                            middle_m + at,
+                            Tip { radius_m: cell_m * (0.5 + 2.0 * dice.f64()), ..Tip::default() },
+                        );
+                    }
+                    3 => {
+                        let point = palpate_tissue::shape::PointId::new(dice.usize(0..shape.point_count()));
+                        if !shape.is_fixed(point) {
+                            tissue.grasp(tool, point, Grasp::Target(3.0 * cell_m * towards));
+                        }
+                    }
+                    _ => tissue.push(
+                        tool,
+                        Some(Push::Constant(Poke {
+                            point: None,
+                            centre_m: middle_m + 0.4 * side * size_m,
+                            force_n: 100.0 * hand_n * towards,
+                            falloff_per_m: 10_f64.powf(dice.f64()) / cell_m,
+                            falloff_offset: 0.0,
+                        })),
+                    ),
+                }
+            }
+            recovered += u64::from(recovers(&mut *tissue));
+            if step % 10 == 0 {
+                assert!(all_finite(&*tissue), "{}, step {step}", case.about);
+            }
+        }
+        (0..3).for_each(|tool| tissue.release(tool));
+        guarded += tissue.guard_events();
+        // A soft solid under this damping creeps for seconds.
+        let mut waited = 0;
+        while waited < 20_000 && tissue.largest_displacement_m() >= 0.05 * cell_m {
+            recovered += u64::from(recovers(&mut *tissue));
+            waited += 1;
+        }
+        let left_m = tissue.largest_displacement_m();
+        assert!(left_m < 0.05 * cell_m, "{}: {:.3} cells from rest", case.about, left_m / cell_m);
+    }
+    println!("{played} of {solids} solids, {guarded} events of the guard, {recovered} recoveries");
+    assert!(2 * played >= solids, "{played} of {solids} were played");
 }
 
 /// Scenes where only the damping is fast, dt·C/m from 0.7 to 90: `rk4` was stable by its vibrations alone, and grew.

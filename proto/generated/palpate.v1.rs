@@ -2917,9 +2917,12 @@ pub struct MeshReport {
     pub problems: ::prost::alloc::vec::Vec<MeshProblem>,
     #[prost(string, repeated, tag = "9")]
     pub groups: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// Whether the mesh can't be used: `problems` says why.
+    /// Whether the mesh can't be a surface of tissue: `problems` says why.
     #[prost(bool, tag = "10")]
     pub refused: bool,
+    /// Whether a mesh that is refused can be a solid all the same, because only the way its triangles are joined is wrong.
+    #[prost(bool, tag = "11")]
+    pub solid_only: bool,
 }
 impl ::prost::Name for MeshReport {
     const NAME: &'static str = "MeshReport";

@@ -481,6 +481,7 @@ Field { number: 7, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 8, is_list: true, kind: FieldKind::Message(71) },
 Field { number: 9, is_list: true, kind: FieldKind::Text },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.MeshProblem", bytes: size_of::<crate::pb::MeshProblem>(), decode: |bytes| <crate::pb::MeshProblem as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },

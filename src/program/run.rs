@@ -1,4 +1,4 @@
-//! `palpate run`: plays a script on a scene, offline.
+//! `palpate run`: plays a script on a scene, or indents it, offline.
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -9,6 +9,7 @@ use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, StageTime, Summary};
 
+use super::indent::{self, IndentArguments};
 use super::scene::{SceneArguments, compile};
 use super::{Failure, clock_s, say, with_progress};
 
@@ -16,8 +17,11 @@ use super::{Failure, clock_s, say, with_progress};
 pub(crate) struct RunArguments {
     #[command(flatten)]
     scene: SceneArguments,
-    /// A script file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
+    /// A script file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …; or `indent`: press a tip
+    /// into the tissue and print its force over its depth
     script: PathBuf,
+    #[command(flatten)]
+    indent: IndentArguments,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -45,6 +49,10 @@ pub(crate) struct RunArguments {
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
+    if arguments.script.as_os_str() == indent::NAME {
+        return indent::run(&arguments.indent, &model, &limits, arguments.output.as_deref(), arguments.quiet);
+    }
+    arguments.indent.refuse_without_indent()?;
     let script = find_script(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
         say!("palpate: warning: {warning}");

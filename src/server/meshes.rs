@@ -129,7 +129,8 @@ pub(super) struct UploadReading {
 
 impl UploadReading {
     /// Reads the file, repairs the mesh if `mends`, and returns a report. Keeps the mesh for use by sessions unless
-    /// the report refuses it.
+    /// the report refuses it for solids too.
+    ///
     /// # Errors
     /// Refuses a file that can't be read (with element and place), too little memory, and when `stop` is set.
     pub(super) fn finish(mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
@@ -186,8 +187,9 @@ impl UploadReading {
             problems,
             groups: mesh.groups.iter().map(|group| group.name.clone()).take(GROUPS_TOLD).collect(),
             refused,
+            solid_only: refused && found.may_enclose(),
         };
-        if !refused {
+        if !refused || report.solid_only {
             let bytes = bytes_of(&mesh);
             self.received.finish(mesh, bytes)?;
         }

@@ -12,7 +12,7 @@ use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::script::Script;
 
 #[path = "closed_mesh.rs"]
-mod closed_mesh;
+pub mod closed_mesh;
 
 use closed_mesh::closed_mesh;
 
@@ -51,12 +51,7 @@ pub fn case(seed: u64) -> RandomScene {
     let force = [level * angle.cos(), level * angle.sin(), along_z].map(|part| part * force);
     let bending = uniform(0.0, 1.0) < 0.4;
     let fixed = ["", "fixed = \"edges\"\n", "fixed = \"corners\"\n"][uniform(0.0, 3.0) as usize];
-    let profile = match uniform(0.0, 4.0) as usize {
-        0 => "{ type = \"constant\" }".to_owned(),
-        1 => "{ type = \"pulse\", on_s = 0.1, off_s = 0.4 }".to_owned(),
-        2 => "{ type = \"ramp\", from_s = 0.05, to_s = 0.25 }".to_owned(),
-        _ => format!("{{ type = \"sine\", frequency_hz = {:?} }}", uniform(0.5, 20.0)),
-    };
+    let profile = profile(&mut uniform);
     let duration = [0.5, 1.0][uniform(0.0, 2.0) as usize];
     let [nx, ny] = sides;
     let [i, j] = control;
@@ -117,12 +112,7 @@ pub fn mesh_case(seed: u64) -> RandomScene {
     let bending = [0.0, 0.1, 0.5][uniform(0.0, 3.0) as usize];
     let vertex = uniform(0.0, mesh.places_m.len() as f64) as usize;
     let place_m = mesh.places_m[vertex];
-    let profile = match uniform(0.0, 4.0) as usize {
-        0 => "{ type = \"constant\" }".to_owned(),
-        1 => "{ type = \"pulse\", on_s = 0.1, off_s = 0.4 }".to_owned(),
-        2 => "{ type = \"ramp\", from_s = 0.05, to_s = 0.25 }".to_owned(),
-        _ => format!("{{ type = \"sine\", frequency_hz = {:?} }}", uniform(0.5, 20.0)),
-    };
+    let profile = profile(&mut uniform);
     let away_m = place_m.iter().map(|c| c * c).sum::<f64>().sqrt();
     let force_n = strain * edge_m * (anchor_n_per_m + 0.3 * stiffness_n_per_m);
     let towards = [(); 3].map(|()| uniform(-1.0, 1.0));
@@ -147,6 +137,85 @@ pub fn mesh_case(seed: u64) -> RandomScene {
              vertex = {vertex}\nforce_n = {force_n:?}\nfalloff_per_m = {:?}\nfalloff_offset = 0.0\nprofile = {profile}\n",
             falloff / edge_m
         ),
+    }
+}
+
+/// Solids that fill closed meshes of uneven triangles: 6 mm to 0.2 m wide, 60 to 600 cells, fastest vibration × 1 ms from 0.2
+/// to 5 without lumps, ν from 0 to 0.495, damping from 3 to 300 a second, half of them with a lump of 0.05 to 20 times their
+/// E; forces inward that strain the cells under them by about 1 to 20 %.
+pub fn solid_case(seed: u64) -> RandomScene {
+    let mut random = fastrand::Rng::with_seed(seed);
+    let mesh = closed_mesh(&mut random);
+    let mut uniform = |from: f64, to: f64| from + (to - from) * random.f64();
+    let mut decades = |from: f64, to: f64| uniform(from.ln(), to.ln()).exp();
+    let (turn, damping_per_s, strain, falloff) =
+        (decades(0.2, 5.0), decades(3.0, 300.0), decades(0.01, 0.2), decades(0.3, 3.0));
+    let (factor, cells) = (decades(0.05, 20.0), decades(60.0, 600.0).round());
+    // As many near ½ as near 0.
+    let poissons_ratio =
+        if uniform(0.0, 1.0) < 0.5 { uniform(0.0, 0.45) } else { 0.5 - 0.005 * 10_f64.powf(uniform(0.0, 1.0)) };
+    let side = |c: usize| {
+        let along = mesh.places_m.iter().map(|place_m| place_m[c]);
+        let (least, most) = (along.clone().fold(f64::INFINITY, f64::min), along.fold(f64::NEG_INFINITY, f64::max));
+        (least, most - least)
+    };
+    let [x, y, z] = [0, 1, 2].map(side);
+    // An ellipsoid fills about half of its box.
+    let cell_m = (0.5 * x.1 * y.1 * z.1 / cells).cbrt();
+    // ω² = 4·(3λ + 2μ)/(ρ·a²), with 3λ + 2μ = E/(1 − 2ν).
+    let youngs_pa = 0.25 * (1.0 - 2.0 * poissons_ratio) * 1060.0 * (cell_m * turn / 1e-3_f64).powi(2);
+    let plane_m = z.0 + 0.2 * z.1;
+    let count = mesh.places_m.len();
+    // One that is not held: the upper pole, or one near it.
+    let highest = (0..count).filter(|v| mesh.places_m[*v][2] > z.0 + 0.5 * z.1).collect::<Vec<_>>();
+    let vertex = highest[uniform(0.0, highest.len() as f64) as usize];
+    let place_m = mesh.places_m[vertex];
+    let away_m = place_m.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let force_n = strain * youngs_pa * cell_m * cell_m / (1.0 + (2.0 / falloff).powi(2));
+    let towards = [(); 3].map(|()| uniform(-1.0, 1.0));
+    let force_n = [0, 1, 2].map(|c| force_n * (0.3 * towards[c] - place_m[c] / away_m));
+    let profile = profile(&mut uniform);
+    let lump = match uniform(0.0, 1.0) < 0.5 {
+        true => format!(
+            "[[inclusion]]\ncentre_m = {:?}\nradius_m = {:?}\nstiffness_factor = {factor:?}\n",
+            place_m.map(|c| 0.5 * c),
+            cell_m * uniform(1.0, 2.0)
+        ),
+        false => String::new(),
+    };
+    let others = mesh.triangles.iter().find(|triangle| triangle.contains(&(vertex as u32)));
+    let watched: Vec<u32> = others.into_iter().flatten().copied().collect();
+    RandomScene {
+        mesh: Some(mesh.obj()),
+        scene: format!(
+            "name = \"random {seed}\"\n[solid]\nfile = \"mesh.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
+             fixed = [{{ plane_m = [0, 0, {plane_m:?}], normal = [0, 0, 1], within_m = {:?} }}]\n\
+             [material]\nyoungs_modulus_pa = {youngs_pa:?}\npoissons_ratio = {poissons_ratio:?}\n\
+             damping_per_s = {damping_per_s:?}\n{lump}",
+            0.2 * z.1
+        ),
+        about: format!(
+            "solid of seed {seed}: about {cells} cells of {:.2} mm, ω·1 ms {turn:.2}, ν {poissons_ratio:.3}, damping \
+             {damping_per_s:.1}, strain {strain:.2}, falloff {falloff:.2} a cell, {}{}",
+            1e3 * cell_m,
+            if lump.is_empty() { String::new() } else { format!("lump × {factor:.2}, ") },
+            profile.replace("type = ", "")
+        ),
+        script: format!(
+            "name = \"random {seed}\"\nduration_s = 0.5\nsample_every_s = 0.025\nsample_points = {watched:?}\n[[force]]\n\
+             vertex = {vertex}\nforce_n = {force_n:?}\nfalloff_per_m = {:?}\nfalloff_offset = 0.0\nprofile = {profile}\n",
+            falloff / cell_m
+        ),
+    }
+}
+
+/// A profile of a force: constant, a pulse, a ramp, or a sine of 0.5 to 20 Hz.
+fn profile(uniform: &mut impl FnMut(f64, f64) -> f64) -> String {
+    match uniform(0.0, 4.0) as usize {
+        0 => "{ type = \"constant\" }".to_owned(),
+        1 => "{ type = \"pulse\", on_s = 0.1, off_s = 0.4 }".to_owned(),
+        2 => "{ type = \"ramp\", from_s = 0.05, to_s = 0.25 }".to_owned(),
+        _ => format!("{{ type = \"sine\", frequency_hz = {:?} }}", uniform(0.5, 20.0)),
     }
 }
 
@@ -226,7 +295,13 @@ pub fn play(case: &RandomScene, assignments: &[String], clock_s: &dyn Fn() -> f6
 
 /// The case in f64 at a tolerance of 1e-10, with everything awake.
 pub fn truth(case: &RandomScene) -> Result<Played, String> {
-    let settings = ["stepping.precision=f64", "stepping.tolerance=1e-10", "sleep.tolerance=0"];
+    truth_within(case, 1e-10)
+}
+
+/// The case in f64 at another tolerance, with everything awake.
+pub fn truth_within(case: &RandomScene, tolerance: f64) -> Result<Played, String> {
+    let tolerance = format!("stepping.tolerance={tolerance:e}");
+    let settings = ["stepping.precision=f64", &tolerance, "sleep.tolerance=0"];
     play(case, &settings.map(str::to_owned), &|| 0.0)
 }
 

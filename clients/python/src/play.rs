@@ -225,6 +225,7 @@ pub(crate) async fn play(
         guard_events: 0,
         final_hash,
         audited_error: None,
+        mesh_error_estimate: None,
         corrections: Vec::new(),
         recoveries: ended.recoveries.into_iter().map(wire::sample::from_recovery).collect(),
         warnings,

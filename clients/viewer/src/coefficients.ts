@@ -24,6 +24,13 @@ const DAMPING_RATIO = 0.5;
 /** If there are more vertices than this, the server is asked to simulate only so many. Frames show all of them. */
 export const MAX_VERTICES = 12_000;
 
+/** A solid: usual soft tissue, in so many cells that one core steps it in real time. */
+const SOLID = { youngsModulusPa: 8000, poissonsRatio: 0.45, densityKgPerM3: DENSITY_KG_PER_M3, dampingPerS: 60, cells: 2500 };
+/** The error of such cells is larger. */
+const SOLID_TOLERANCE = 1e-2;
+/** The lowest part of a solid, as a fraction of its height, does not move, as if it lay on a table. */
+const HELD = 0.03;
+
 /** Returns the falloff length of a push: a finger's, but not less than an edge. */
 export function fingerM(sizeM: number, edgeM: number): number {
   return Math.max(FINGER * sizeM, edgeM) || 1;
@@ -65,4 +72,11 @@ export function sceneOf(name: string, meshId: string, report: MeshReport, vertic
     damping: { coefficientNSPerM: 2 * DAMPING_RATIO * Math.sqrt(anchor * mass) },
     stepping: { tolerance: 1e-3 },
   };
+}
+
+/** A scene of a solid that fills a mesh that was sent, held at the bottom. */
+export function solidOf(name: string, meshId: string, { extent }: MeshReport): MessageInitShape<typeof SceneSchema> {
+  const [least, most] = [extent?.leastM?.z ?? 0, extent?.mostM?.z ?? 0];
+  const plane = { planeM: { x: 0, y: 0, z: least }, normal: { x: 0, y: 0, z: 1 }, withinM: HELD * (most - least) };
+  return { name, solid: { meshId, ...SOLID, fixed: [{ part: { case: "plane", value: plane } }] }, stepping: { tolerance: SOLID_TOLERANCE } };
 }

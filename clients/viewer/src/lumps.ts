@@ -26,6 +26,8 @@ const BENEATH = 0.4;
 const EDGE = 0.4;
 /** Stiffness factors of the lump and of what is beneath it, as in the scene `liver-organ`. */
 const STIFFER = { springs: 1.5, support: 5 };
+/** In a solid a lump is a ball of its own: how far beneath the surface its middle is, in radii, and how stiff. */
+const IN_SOLID = { beneath: 1.3, factor: 5 };
 
 /** Returns the lumps of a scene. Parts that are stiff by a group of the mesh have no shape of their own. */
 function lumpsOf(scene: Scene | undefined): Lump[] {
@@ -35,10 +37,12 @@ function lumpsOf(scene: Scene | undefined): Lump[] {
 }
 
 /** Returns a lump beneath a place of the tissue. */
-function lumpAt({ restM, outward }: Place, sizeM: number, edgeM: number): Inclusion {
+function lumpAt({ restM, outward }: Place, sizeM: number, edgeM: number, isSolid: boolean): Inclusion {
   // It must contain some vertices.
   const radiusM = Math.max(RADIUS * sizeM, 1.5 * edgeM);
-  const [x, y, z] = restM.map((v, c) => v - BENEATH * radiusM * outward[c]!) as Vec3;
+  const beneathM = (isSolid ? IN_SOLID.beneath : BENEATH) * radiusM;
+  const [x, y, z] = restM.map((v, c) => v - beneathM * outward[c]!) as Vec3;
+  if (isSolid) return create(InclusionSchema, { centreM: { x, y, z }, radiusM, stiffnessFactor: IN_SOLID.factor });
   return create(InclusionSchema, {
     centreM: { x, y, z },
     radiusM,
@@ -100,7 +104,7 @@ export class Lumps {
     this.place(false);
     const [scene, shownSession] = [this.host.scene(), this.host.present()];
     if (!scene || !shownSession) return;
-    scene.inclusions = place ? [...scene.inclusions, lumpAt(place, shownSession.surface.sizeM, shownSession.edgeM)] : [];
+    scene.inclusions = place ? [...scene.inclusions, lumpAt(place, shownSession.surface.sizeM, shownSession.edgeM, scene.solid !== undefined)] : [];
     try {
       // A user who adds a lump wants to see where it is.
       if (place) this.box.checked = true;

@@ -9,11 +9,13 @@ const KNOWN: Record<string, [title: string, group: Group]> = {
   "liver-organ": ["Liver with two lumps", "Organs"],
   "liver-solid": ["Liver with an inside", "Organs"],
   kidney: ["Kidney with an inside", "Organs"],
+  prostate: ["Prostate with two nodules", "Organs"],
   colon: ["Colon", "Organs"],
   gallbladder: ["Gallbladder", "Organs"],
   liver: ["Liver", "Slabs of tissue"],
   fibrotic: ["Scarred liver", "Slabs of tissue"],
   stomach: ["Stomach wall", "Slabs of tissue"],
+  phantom: ["Silicone with a lump", "Slabs of tissue"],
   paper: ["Sheet of the paper", "From the paper"],
 };
 

@@ -6,7 +6,7 @@
 // unit.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
-import { MAX_VERTICES, sceneOf } from "./coefficients";
+import { MAX_VERTICES, sceneOf, solidOf } from "./coefficients";
 import type { MeshProblem, MeshReport, SceneSchema, Session } from "palpate/v1";
 import { part } from "./page";
 import { describe, CALL_TIMEOUT_MS, sessions } from "./server";
@@ -26,6 +26,9 @@ const UNITS = [
   { unit: "cm", name: "centimetres", metres: 1e-2 },
   { unit: "m", name: "metres", metres: 1 },
 ] as const;
+
+/** What a mesh becomes: its surface on springs, or a solid that fills it. */
+type Kind = "surface" | "solid";
 
 type Scene = MessageInitShape<typeof SceneSchema>;
 
@@ -146,14 +149,16 @@ export class FileOpener {
     const chosen = await this.askUnit(raw, sent.kept, signal);
     const { unit } = chosen;
     if (unit !== "m") sent = await this.send(file, unit, false, signal);
-    if ((await this.showReport(sent.report, chosen, false, signal)) === "mend") {
+    let kind = await this.showReport(sent.report, chosen, false, signal);
+    if (kind === "mend") {
       sent = await this.send(file, unit, true, signal);
-      await this.showReport(sent.report, chosen, true, signal);
+      kind = await this.showReport(sent.report, chosen, true, signal);
     }
-    this.show("Making the tissue …");
+    if (kind === "mend") throw new Ended();
+    this.show(kind === "solid" ? "Filling it with cells …" : "Making the tissue …");
     this.progress.hidden = false;
     this.progress.removeAttribute("value");
-    const [session, scene] = await this.make(file.name, sent, signal);
+    const [session, scene] = await this.make(file.name, sent, kind, signal);
     this.dialog.close();
     if (session) this.onSession(session, scene);
   }
@@ -201,32 +206,47 @@ export class FileOpener {
     return UNITS.find(({ unit }) => unit === chosen) ?? UNITS[0];
   }
 
-  /** Shows a report. If there are no problems, no answer is needed. */
+  /**
+   * Shows a report, with what is wrong, and asks what the mesh shall become. An open mesh has no inside; one whose
+   * triangles form no surface may have one.
+   */
   private async showReport(
     report: MeshReport,
     unit: (typeof UNITS)[number],
     isMended: boolean,
     signal: AbortSignal,
-  ): Promise<"touch" | "mend"> {
-    const { problems, refused } = report;
-    if (!refused && problems.length === 0) return "touch";
+  ): Promise<Kind | "mend"> {
+    const { problems, refused, solidOnly, holes } = report;
     const told = problems.slice(0, TOLD).map((problem) => problemText(problem, unit));
     if (problems.length > TOLD) told.push(`and ${problems.length - TOLD} more`);
     const mendable = "It can't be used as it is. “Mend it” lets the server repair what can be repaired:";
     const beyond = "It can't be used, and the server could not mend all of it. A program that edits meshes may:";
-    const usable = isMended ? "Mended:" : "It can be used. Worth knowing:";
-    this.show(`${reportText(report)}. ${refused ? (isMended ? beyond : mendable) : usable}`, told);
-    const answers = [["touch", "Touch it"], ["mend", "Mend it"]] as const;
-    return await this.ask(answers.filter(([value]) => (value === "touch" ? !refused : !isMended)), signal);
+    const usable = told.length === 0 ? "What shall it be?" : isMended ? "Mended:" : "It can be used. Worth knowing:";
+    const filled = "It can be a solid; it is no surface for springs:";
+    const verdict = !refused ? usable : solidOnly ? filled : isMended ? beyond : mendable;
+    const answers = [
+      ...(refused ? [] : [["surface", "Touch its surface"] as const]),
+      ...((refused && !solidOnly) || holes > 0 ? [] : [["solid", "Touch it as a solid"] as const]),
+      ...(isMended || problems.length === 0 ? [] : [["mend", "Mend it"] as const]),
+    ];
+    const [only, ...others] = answers;
+    if (only && problems.length === 0 && others.length === 0) return only[0];
+    this.show(`${reportText(report)}. ${verdict}`, told);
+    return await this.ask(answers, signal);
   }
 
-  /** Creates a session, with fewer points than vertices if there are many and the server can decimate. */
-  private async make(fileName: string, { meshId, report }: Sent, signal: AbortSignal): Promise<[Session | undefined, Scene]> {
+  /** Creates a session of a solid, or of a surface. */
+  private async make(fileName: string, { meshId, report }: Sent, kind: Kind, signal: AbortSignal): Promise<[Session | undefined, Scene]> {
     const name = fileName.replace(/\.[^.]*$/, "") || fileName;
     const call = { signal, timeoutMs: READING_MS };
+    const create = async (value: Scene) => (await sessions.createSession({ source: { case: "scene", value } }, call)).session;
+    if (kind === "solid") {
+      const solid = solidOf(name, meshId, report);
+      return [await create(solid), solid];
+    }
+    // A surface has fewer points than vertices if there are many and the server can decimate.
     const fewer = Math.min(report.vertices, MAX_VERTICES);
     const scene = sceneOf(name, meshId, report, fewer);
-    const create = async (value: Scene) => (await sessions.createSession({ source: { case: "scene", value } }, call)).session;
     const session = await create(scene);
     if (!session || session.points <= 1.5 * fewer) return [session, scene];
     // A server that can't decimate simulates all vertices, which need other coefficients.

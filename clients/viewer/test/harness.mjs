@@ -4,6 +4,7 @@ import { spawn, spawnSync } from "node:child_process";
 import { existsSync, mkdirSync } from "node:fs";
 import { delimiter, join, resolve } from "node:path";
 import { createInterface } from "node:readline";
+import { after, before } from "node:test";
 import { fileURLToPath } from "node:url";
 import { constants, inflateSync } from "node:zlib";
 import { chromium } from "playwright-core";
@@ -56,6 +57,29 @@ export function launch() {
   });
 }
 
+/**
+ * A browser for the tests of a file, and pages in it. Each page has a profile of its own, so that other pages'
+ * connections are not counted with its.
+ * @param {{ width: number, height: number }} viewport
+ */
+export function pages(viewport) {
+  /** @type {import("playwright-core").Browser} */
+  let browser;
+  before(async () => {
+    browser = await launch();
+  });
+  after(() => browser?.close());
+  const context = (options = {}) => browser.newContext({ viewport, ...options });
+  return {
+    chromium: () => browser,
+    context,
+    /** @param {string} url */
+    open: async (url, options = {}) => await Page.open(await context(options), url),
+    /** @param {Page} page */
+    close: async (page) => await page.page.context().close(),
+  };
+}
+
 /** A page that is being loaded can't answer yet. @param {unknown} error */
 function whileLoading(error) {
   if (/context was destroyed|navigation|Cannot find context/.test(String(error))) return false;
@@ -106,6 +130,9 @@ export async function callSession({ url }, method, sessionId) {
   ];
   return status === "0" ? undefined : `${status} ${message}`;
 }
+
+/** The tissue of most tests: a push moves it by centimetres. @param {Server} server */
+export const paper = ({ url }) => `${url}/?scene=paper`;
 
 /** Red, green and blue of a pixel of a screenshot. @param {import("playwright-core").Page} page @param {number} x @param {number} y */
 export async function colourAt(page, x, y) {
@@ -270,6 +297,12 @@ export class Page {
    */
   at(x, y) {
     return this.page.evaluate(`window.palpate.at(${x}, ${y})`);
+  }
+
+  /** Lets go, and waits until the tissue is at rest. */
+  async rests() {
+    await this.page.mouse.up();
+    await this.until(({ largestM, forceN }) => largestM < 0.004 && forceN.length === 0);
   }
 
   /** Presses with the mouse in the middle, or elsewhere. */

@@ -5,26 +5,16 @@ import { mkdtempSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { callSession, cut, launch, makeToken, Page, Server } from "./harness.mjs";
+import { callSession, cut, makeToken, pages, Server } from "./harness.mjs";
 
-/** @type {import("playwright-core").Browser} */
-let browser;
+/** @typedef {import("./harness.mjs").Page} Page */
+
+const { open, close } = pages({ width: 1100, height: 640 });
+
 /** @type {Server} */
 let server;
 
-const VIEWPORT = { viewport: { width: 1100, height: 640 } };
-
 const folder = () => mkdtempSync(join(tmpdir(), "palpate-"));
-
-/** @param {string} url */
-async function open(url, options = {}) {
-  return await Page.open(await browser.newContext({ ...VIEWPORT, ...options }), url);
-}
-
-/** @param {Page} page */
-async function close(page) {
-  await page.page.context().close();
-}
 
 /** @param {Page} page */
 const sessionOf = (page) => new URL(page.page.url()).searchParams.get("session") ?? assert.fail("the address names no session");
@@ -92,11 +82,9 @@ async function pressedPart(page) {
 }
 
 before(async () => {
-  browser = await launch();
   server = await Server.start(["--journal", folder()]);
 });
 after(async () => {
-  await browser?.close();
   assert.equal(await server?.stop(), 0, "the server ends well although recordings were open");
 });
 
@@ -374,6 +362,8 @@ describe("a live session that is recorded", () => {
     assert.equal(sessionOf(page), id);
     assert.deepEqual(await page.ask(({ camera }) => camera), camera, "the camera stays");
     await gone(server, playback);
+    // The other user's page is closed; if its last request did not arrive, its lease has to lapse.
+    await page.says("holder", /Nobody touches/);
     await page.press(0.4, 0.5);
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await page.page.mouse.up();

@@ -2,17 +2,22 @@
 //!
 //! Rays along z cross the surface. Each triangle that a ray crosses upwards out of the inside counts −1, into it +1; a
 //! place is inside where the count is not 0. So parts that overlap count once, and a surface that crosses itself has no
-//! hole there. On a ray whose counts do not end at 0, as of a triangle that is turned round, every crossing changes sides
-//! instead. A ray that then ends inside runs through a hole of the surface, and is left out.
+//! hole there. If the counts of a ray do not end at 0, it crosses triangles that are turned, doubled or missing. Then the
+//! winding number between two crossings tells whether that part of the ray is inside: more than one half. Where it is near one
+//! half, every crossing changes sides, if their number is even; if it is odd, the ray passes near a hole.
 //!
 //! Along a ray the part is exact; across, a cell is the mean of [`RAYS`]² rays.
 
 use glam::{DVec2, DVec3};
 
+use crate::winding::Winding;
 use crate::work::spend;
 
 /// Rays along each side of a cell.
 pub const RAYS: usize = 4;
+
+/// Shortest part of a ray on which a hole is seen, in edges.
+const SEEN: f64 = 0.5;
 
 /// A lattice of cubes, parallel to the axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,9 +58,9 @@ impl Lattice {
 pub struct Filled {
     /// For each cube of the lattice ([`Lattice::index`]) the part of it that is inside, 0 to 1.
     pub parts: Vec<f32>,
-    /// Rays that run through a hole, divided by the rays that cross the surface: 0 for a closed surface.
+    /// Rays that pass near a hole, divided by the rays that cross the surface: 0 for a closed surface.
     pub open_part: f64,
-    /// A place on a ray through a hole, m; `None` for a closed surface.
+    /// A place near a hole, m; `None` for a closed surface.
     pub open_at_m: Option<DVec3>,
 }
 
@@ -83,26 +88,49 @@ fn side(a: (u32, DVec2), b: (u32, DVec2), place: DVec2) -> f64 {
 pub fn filled(vertices_m: &[DVec3], triangles: &[[u32; 3]], lattice: &Lattice) -> Filled {
     let crossings = crossings(vertices_m, triangles, lattice);
     let mut parts = vec![0.0_f32; lattice.count()];
-    let (mut crossed, mut open, mut open_at_m) = (0_usize, 0_usize, None);
+    let (mut crossed, mut open, mut open_at_m, mut winding) = (0_usize, 0_usize, None, None);
     let rays = lattice.cells[0] * RAYS;
     for of_ray in crossings.chunk_by(|a, b| a.ray == b.ray) {
         crossed += 1;
         let ray = of_ray[0].ray as usize;
         let [x, y] = [ray % rays, ray / rays];
-        let is_counted = of_ray.iter().map(|crossing| i32::from(crossing.into)).sum::<i32>() == 0;
-        if !is_counted && of_ray.len() % 2 == 1 {
-            open += 1;
-            let place = place_of([x, y]).extend(of_ray[of_ray.len() / 2].height);
-            open_at_m = open_at_m.or(Some(lattice.origin_m + lattice.edge_m * place));
+        let mut fill = |pair: &[RayCrossing]| {
+            let column = |k: usize| lattice.index([x / RAYS, y / RAYS, k]);
+            add(pair[0].height, pair[1].height, lattice.cells[2], |k, length| parts[column(k)] += length);
+        };
+        if of_ray.iter().map(|crossing| i32::from(crossing.into)).sum::<i32>() == 0 {
+            let mut count = 0;
+            for pair in of_ray.windows(2) {
+                count += i32::from(pair[0].into);
+                if count != 0 {
+                    fill(pair);
+                }
+            }
             continue;
         }
-        let column = |k: usize| lattice.index([x / RAYS, y / RAYS, k]);
-        let mut count = 0;
-        for pair in of_ray.windows(2) {
-            count = if is_counted { count + i32::from(pair[0].into) } else { 1 - count };
-            if count != 0 {
-                add(pair[0].height, pair[1].height, lattice.cells[2], |k, length| parts[column(k)] += length);
+        let winding = winding.get_or_insert_with(|| Winding::new(vertices_m, triangles));
+        let place_m = |height: f64| lattice.origin_m + lattice.edge_m * place_of([x, y]).extend(height);
+        let is_even = of_ray.len().is_multiple_of(2);
+        let mut told = |is_open: bool, middle_m: DVec3| {
+            if is_open {
+                open += 1;
+                open_at_m = open_at_m.or(Some(middle_m));
             }
+        };
+        for (number, pair) in of_ray.windows(2).enumerate() {
+            let middle_m = place_m(0.5 * (pair[0].height + pair[1].height));
+            let around = winding.around(middle_m).abs();
+            let is_clear = (around - 0.5).abs() > 0.25;
+            // Next to one triangle that is turned or doubled, the part of the ray is short.
+            told(!is_clear && !is_even && pair[1].height - pair[0].height >= SEEN, middle_m);
+            let is_inside = if is_clear || !is_even { around > 0.5 } else { number % 2 == 0 };
+            if is_inside {
+                fill(pair);
+            }
+        }
+        // Beyond its ends the ray is outside, if there is no hole.
+        for beyond in [of_ray[0].height - SEEN, of_ray[of_ray.len() - 1].height + SEEN] {
+            told(!is_even && winding.around(place_m(beyond)).abs() > 0.25, place_m(beyond));
         }
     }
     #[allow(clippy::cast_precision_loss)]
@@ -246,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ray_through_a_hole_is_left_out_and_its_place_told() {
+    fn a_hole_is_told_with_a_place() {
         let (vertices, triangles) = block(DVec3::splat(0.05), DVec3::splat(2.05));
         // Half of the upper face is missing.
         let found = filled(&vertices, &triangles[..3], &lattice(0.5, [5, 5, 5]));

@@ -1,12 +1,14 @@
 //! Triangle meshes of organs: reading, checking, repairing, writing and generating them. Independent of tissue,
 //! network and clock.
 
+pub mod cell_surface;
 mod curvature;
 pub mod decimate;
 pub mod delaunay;
 pub mod fill;
 pub mod format;
 mod join;
+mod manifold_grid;
 pub mod mesh;
 pub mod organ;
 mod orient;
@@ -23,6 +25,7 @@ pub mod topology;
 mod tree;
 pub mod unit;
 mod walls;
+mod winding;
 pub mod work;
 pub mod write;
 

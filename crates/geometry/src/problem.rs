@@ -155,6 +155,12 @@ impl Problem {
         }
     }
 
+    /// Returns whether the fault is in how triangles are joined: the mesh is no surface, but may have an inside.
+    #[must_use]
+    pub fn is_of_joints(&self) -> bool {
+        matches!(self, Problem::NonManifoldEdge { .. } | Problem::NonManifoldVertex { .. } | Problem::Orientation)
+    }
+
     /// Returns whether a file or mesh with this fault is refused; otherwise the user is warned.
     #[must_use]
     pub fn is_refused(&self) -> bool {

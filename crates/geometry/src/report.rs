@@ -187,6 +187,14 @@ impl MeshReport {
     pub fn refusal(&self) -> Option<&Finding> {
         self.problems.iter().find(|finding| finding.problem.is_refused())
     }
+
+    /// Returns whether the triangles may enclose a space: nothing else is refused than how they are joined
+    /// ([`Problem::is_of_joints`]).
+    #[must_use]
+    pub fn may_enclose(&self) -> bool {
+        let mut refused = self.problems.iter().filter(|finding| finding.problem.is_refused());
+        refused.all(|finding| finding.problem.is_of_joints())
+    }
 }
 
 /// Collects problems.

@@ -204,7 +204,16 @@ fn surfaces_face_the_side_that_is_touched() {
 
 #[test]
 fn sizes_are_those_of_adults() {
-    let longest_mm = [(75.0, 105.0), (165.0, 205.0), (100.0, 135.0), (220.0, 265.0), (199.0, 201.0), (99.0, 101.0)];
+    let longest_mm = [
+        (75.0, 105.0),
+        (165.0, 205.0),
+        (100.0, 135.0),
+        (220.0, 265.0),
+        (199.0, 201.0),
+        (99.0, 101.0),
+        (38.0, 56.0),
+        (99.9, 100.1),
+    ];
     for (organ, (least, most)) in Organ::ALL.into_iter().zip(longest_mm) {
         for seed in 0..4 {
             let mesh = generate(organ, 3.5e-3, seed).unwrap();
@@ -217,11 +226,12 @@ fn sizes_are_those_of_adults() {
 }
 
 #[test]
-fn seeds_differ_and_repeat() {
+fn seeds_differ_except_of_a_phantom_and_repeat() {
     for organ in Organ::ALL {
         let mesh = generate(organ, 3.5e-3, 1).unwrap();
         assert_eq!(mesh, generate(organ, 3.5e-3, 1).unwrap());
-        assert_ne!(mesh.vertices_m, generate(organ, 3.5e-3, 2).unwrap().vertices_m);
+        let is_same = mesh.vertices_m == generate(organ, 3.5e-3, 2).unwrap().vertices_m;
+        assert_eq!(is_same, organ == Organ::Phantom, "{organ}");
     }
 }
 

@@ -19,6 +19,7 @@ pub mod budget;
 pub mod check;
 pub mod command;
 pub mod current_laws;
+pub mod indentation;
 pub mod input;
 pub mod intake;
 pub mod intake_transfer;

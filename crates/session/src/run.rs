@@ -5,9 +5,13 @@ use std::sync::Arc;
 
 use super::audit::{Twin, Windows};
 use super::simulation::{Simulation, SimulationFailure};
+use palpate_haptics::Tip;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::response::mesh_error::MeshError;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
+use palpate_tissue::scene::profile::PoseProfile;
 use palpate_tissue::scene::record::{Line, Record, Run, Summary, far_warning, write_line};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::{Model, StageTimes, Tissue};
@@ -164,6 +168,7 @@ pub fn run_with(
     let warnings = far_warning(largest_displacement_m, model.shape()).into_iter().chain(on_fixed).collect();
     let summary = Summary {
         audited_error,
+        mesh_error_estimate: MeshError::of(model, disc(model, script)).map(|error| error.relative),
         corrections,
         recoveries: session.recoveries().list(),
         warnings,
@@ -174,6 +179,14 @@ pub fn run_with(
     };
     tell(RunEvent::Summary(&summary))?;
     Ok(summary)
+}
+
+/// Returns the disc of the first tip of a script, where it is first; without a tip that of a fingertip in the middle.
+fn disc(model: &Model, script: &Script) -> Disc {
+    match script.poses.first() {
+        Some(PoseProfile { tip, poses, .. }) if !poses.is_empty() => Disc { radius_m: tip.radius_m, at_m: poses[0].1 },
+        _ => Disc::in_middle(model, Tip::default().radius_m),
+    }
 }
 
 /// Writes an event of a run as a JSON line, or reports progress.
@@ -209,6 +222,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         guard_events: tissue.guard_events(),
         final_hash: format!("{:032x}", tissue.state_hash()),
         audited_error: None,
+        mesh_error_estimate: None,
         corrections: Vec::new(),
         recoveries: Vec::new(),
         warnings: Vec::new(),

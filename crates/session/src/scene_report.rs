@@ -9,6 +9,7 @@ use palpate_haptics::{Coupling, Law, Tip};
 
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
+use palpate_tissue::response::mesh_error::MeshError;
 use palpate_tissue::scene::BodyKind;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
@@ -38,6 +39,8 @@ pub(super) struct Prospect {
     law: Option<Law>,
     /// Why there is no law.
     no_law: &'static str,
+    /// The error of the cells of a solid under that fingertip.
+    cells: Option<MeshError>,
     /// Depth of the deepest sensible press by a fingertip, m: half the shorter side, or as far as the law reaches.
     deepest_m: f64,
     is_by_law: bool,
@@ -132,6 +135,7 @@ impl Prospect {
             radius_m,
             law,
             no_law: "its force law takes too much work",
+            cells: MeshError::of(model, Disc::in_middle(model, radius_m)),
             deepest_m: half_m.min(reach_m),
             is_by_law: reach_m < half_m,
             rest_s: Relaxation::of(&model.scene).rest_s(AT_REST),
@@ -377,6 +381,15 @@ impl fmt::Display for Prospect {
                 writeln!(f, "deepest       {} at {force} N: {why}", length(self.deepest_m))?;
             }
             _ => writeln!(f, "fingertip     unknown under a disc of {radius} radius: {}", self.no_law)?,
+        }
+        if let Some(error) = self.cells {
+            writeln!(
+                f,
+                "cells         add {:.1} % to the stiffness there (an estimate, by cells of {}); the tolerance is that of stepping \
+                 alone",
+                100.0 * error.relative,
+                length(error.compared_cell_m)
+            )?;
         }
         match self.rest_s {
             Ok(rest_s) => {

@@ -13,6 +13,8 @@ mod kidney;
 mod liver;
 mod net;
 mod patch;
+mod phantom;
+mod prostate;
 mod remesh;
 mod shape;
 mod stomach;
@@ -52,12 +54,25 @@ pub enum Organ {
     /// A slightly curved square of tissue, 100 mm wide, open at its border, raised by lumps beneath. Groups: `rim`,
     /// `lumps`.
     Patch,
+    /// A prostate, 46 mm wide: two lobes with a groove between, and a flat front. Groups: `front`, `apex`, `base`.
+    Prostate,
+    /// A block of 100 × 100 × 40 mm with rounded edges, as of silicone for tests of palpation; no seed varies it. Group:
+    /// `base`.
+    Phantom,
 }
 
 impl Organ {
     /// Every organ, in the order of the variants.
-    pub const ALL: [Organ; 6] =
-        [Organ::Gallbladder, Organ::Liver, Organ::Kidney, Organ::Stomach, Organ::Colon, Organ::Patch];
+    pub const ALL: [Organ; 8] = [
+        Organ::Gallbladder,
+        Organ::Liver,
+        Organ::Kidney,
+        Organ::Stomach,
+        Organ::Colon,
+        Organ::Patch,
+        Organ::Prostate,
+        Organ::Phantom,
+    ];
 
     /// Returns the organ's name in lower case, such as `liver`, which [`FromStr`] parses.
     #[must_use]
@@ -69,6 +84,8 @@ impl Organ {
             Organ::Stomach => "stomach",
             Organ::Colon => "colon",
             Organ::Patch => "patch",
+            Organ::Prostate => "prostate",
+            Organ::Phantom => "phantom",
         }
     }
 
@@ -82,6 +99,8 @@ impl Organ {
             Organ::Stomach => "250 mm, with the ends of the oesophagus and the duodenum",
             Organ::Colon => "a segment of 200 mm with its folds, open at both ends, touched from inside",
             Organ::Patch => "100 mm square, slightly curved, with lumps beneath, open at its border",
+            Organ::Prostate => "46 mm, two lobes with the groove between them, flat at its front",
+            Organ::Phantom => "a block of 100 × 100 × 40 mm, the same for every seed",
         }
     }
 
@@ -95,6 +114,8 @@ impl Organ {
             Organ::Stomach => stomach::shape(dice),
             Organ::Colon => colon::shape(dice),
             Organ::Patch => patch::shape(dice),
+            Organ::Prostate => prostate::shape(dice),
+            Organ::Phantom => phantom::shape(),
         }
     }
 }

@@ -2,4 +2,5 @@
 
 pub(crate) mod around_place;
 pub mod force_law;
+pub mod mesh_error;
 pub mod tangent;

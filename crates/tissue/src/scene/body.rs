@@ -7,6 +7,7 @@ use std::sync::Arc;
 use palpate_geometry::TriangleMesh;
 
 use super::graph::MeshGraph;
+use super::material::Inclusion;
 use super::profile::Poke;
 use super::source::Files;
 use super::springs::Springs;
@@ -70,6 +71,12 @@ pub(super) trait KindOfBody: BodyKind + Sized {
 
     /// Returns the same tissue with points `spacing_m` (m) apart ([`Body::coarser`](super::Body::coarser)).
     fn coarser(&self, _spacing_m: f64, _half_m: f64) -> Option<(Self, f64)> {
+        None
+    }
+
+    /// Returns the same tissue with cells of `cell_m` (m) and these inclusions. `None` for a tissue without cells, and if
+    /// such cells do not fit.
+    fn with_cells(&self, _inclusions: &[Inclusion], _cell_m: f64) -> Option<Self> {
         None
     }
 }
@@ -214,6 +221,12 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
 
     /// Returns the largest measured factor by which the true error of a script may exceed that of a rehearsal.
     fn rehearsal_margin(&self) -> f64;
+
+    /// Returns the strength of a rehearsal's forces, 1 for those that move a point that is held by its own anchor by about a
+    /// distance between points. Where points hold each other only, forces on many of them add up.
+    fn rehearsal_strength(&self) -> f64 {
+        1.0
+    }
 
     /// Returns the approximate memory of the tables of a model, bytes, besides those that every kind has.
     fn table_bytes(&self) -> u64 {

@@ -54,13 +54,17 @@ pub const PAPER: &str = include_str!("../../../../scenes/paper.toml");
 
 /// The built-in scenes: name and TOML text, by ascending name. Some have a mesh, which is generated: none names
 /// a file.
-pub const BUILT_IN: [(&str, &str); 7] = [
+pub const BUILT_IN: [(&str, &str); 11] = [
     ("colon", include_str!("../../../../scenes/colon.toml")),
     ("fibrotic", include_str!("../../../../scenes/fibrotic.toml")),
     ("gallbladder", include_str!("../../../../scenes/gallbladder.toml")),
+    ("kidney", include_str!("../../../../scenes/kidney.toml")),
     ("liver", include_str!("../../../../scenes/liver.toml")),
     ("liver-organ", include_str!("../../../../scenes/liver-organ.toml")),
+    ("liver-solid", include_str!("../../../../scenes/liver-solid.toml")),
     ("paper", PAPER),
+    ("phantom", include_str!("../../../../scenes/phantom.toml")),
+    ("prostate", include_str!("../../../../scenes/prostate.toml")),
     ("stomach", include_str!("../../../../scenes/stomach.toml")),
 ];
 
@@ -180,6 +184,12 @@ macro_rules! kinds {
                     $(Body::$Kind(kind) => {
                         kind.coarser(spacing_m, half_m).map(|(coarse, replaced)| (Body::$Kind(coarse), replaced))
                     })+
+                }
+            }
+
+            fn with_cells(&self, inclusions: &[Inclusion], cell_m: f64) -> Option<Body> {
+                match self {
+                    $(Body::$Kind(kind) => kind.with_cells(inclusions, cell_m).map(Body::$Kind),)+
                 }
             }
         }
@@ -402,6 +412,17 @@ named! {
 }
 
 impl Scene {
+    /// Returns the scene of the same tissue with cells of `cell_m` (m), unchecked. `None` for a tissue without cells, and if
+    /// such cells do not fit.
+    pub(crate) fn with_cells(&self, cell_m: f64) -> Option<Scene> {
+        let body = self.body.with_cells(&self.inclusions, cell_m)?;
+        // k is E times the edge of a cell, and C that of a full cell.
+        let ratio = cell_m / self.shape().edge_m();
+        let stiffness_n_per_m = self.springs.stiffness_n_per_m * ratio;
+        let damping_n_s_per_m = self.damping_n_s_per_m * ratio.powi(3);
+        Some(Scene { body, springs: Springs::alike(stiffness_n_per_m), damping_n_s_per_m, ..self.clone() })
+    }
+
     /// Reads a scene file and applies the `--set` assignments (`key.path=value`), in their order, which
     /// override its keys. The path may be a pipe. Paths of other files start from the file's folder; limits
     /// bound what is read.

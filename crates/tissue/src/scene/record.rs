@@ -149,6 +149,10 @@ pub struct Summary {
     /// audit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub audited_error: Option<AuditedError>,
+    /// How much the size of the cells of a solid adds to its stiffness under the first tip, as a fraction of it (an
+    /// estimate); `None`, and not written, for other tissues.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mesh_error_estimate: Option<f64>,
     /// Corrections after an audit, by ascending step; not written if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub corrections: Vec<Correction>,

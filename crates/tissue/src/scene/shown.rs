@@ -8,7 +8,7 @@ use palpate_geometry::decimate::{MeshPlace, decimate};
 use palpate_geometry::delaunay::flip_to_delaunay;
 use palpate_geometry::surface::nearest_place;
 use palpate_geometry::work::spend;
-use palpate_geometry::{FileMesh, TriangleMesh, prepare};
+use palpate_geometry::{FileMesh, MeshReport, TriangleMesh, prepare};
 
 use crate::shape::BoundPlace;
 use palpate_refusal::{Reason, Refusal, Result};
@@ -58,13 +58,7 @@ impl Simulated {
             let message = format!("{finding}; `palpate mesh FILE --repair` may mend it");
             return Err(Refusal::new(Reason::Unreadable, "mesh", message));
         }
-        let mut findings: Vec<String> = prepared.notes.iter().map(|note| format!("mesh: {note}")).collect();
-        // The first finding of each kind.
-        for (kind, count) in &report.counts {
-            let of_kind = report.problems.iter().find(|finding| finding.problem.name() == *kind);
-            let more = if *count > 1 { format!(" ({count} of this kind: `palpate mesh FILE`)") } else { String::new() };
-            findings.extend(of_kind.map(|first| format!("mesh: {first}{more}")));
-        }
+        let findings = findings_of(&prepared.notes, &report);
         Ok(Self { findings, ..Self::bound(prepared.mesh, prepared.file, vertices, flips) })
     }
 
@@ -105,6 +99,17 @@ fn coarser(mesh: TriangleMesh, file: Option<FileMesh>, vertices: usize, flips: b
     let file = file.unwrap_or_else(|| FileMesh { vertex_of: (0..).take(vertices_m.len()).collect(), mesh });
     let shown = Shown::decimated(file, &vertices_m, &coarse, &before, &decimated.places);
     (coarse, shown)
+}
+
+/// Returns what was done with a mesh and the first problem of each kind, as sentences for the user.
+pub(super) fn findings_of(notes: &[String], report: &MeshReport) -> Vec<String> {
+    let mut findings: Vec<String> = notes.iter().map(|note| format!("mesh: {note}")).collect();
+    for (kind, count) in &report.counts {
+        let of_kind = report.problems.iter().find(|finding| finding.problem.name() == *kind);
+        let more = if *count > 1 { format!(" ({count} of this kind: `palpate mesh FILE`)") } else { String::new() };
+        findings.extend(of_kind.map(|first| format!("mesh: {first}{more}")));
+    }
+    findings
 }
 
 impl Shown {

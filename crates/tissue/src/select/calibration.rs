@@ -264,7 +264,8 @@ impl<'s> Rehearsal<'s> {
         let stiffness = scene.anchor_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
         // Without any spring, a force that moves a point about as far within a step.
         let free = scene.point_mass_kg() * scene.stepping.rate_hz * scene.stepping.rate_hz;
-        let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
+        let strength = scene.body.kind().rehearsal_strength();
+        let newtons = strength * spacing_m * if stiffness > 0.0 { stiffness } else { free };
         let mut tissue = at_rest(&model);
         let profile = LoadProfile {
             centre: CentreProfile::Hops(vec![(0, scene.shape().rest_m(pushed))]),

@@ -22,15 +22,20 @@
 //! fours: rows along x, with A (the part without σ_x) and B (the part with it); the near corner gets A − B, the far one
 //! A + B.
 //!
-//! **Limits.** The law stiffens as λ|cof F|². So that a substep that is stable at rest stays stable however far the tissue
-//! is pressed, the pressure (λ + μ)(J − 1) is multiplied by min(1, [`SOFTENS`]/|cof F|²) and limited to ±[`LARGEST`]·μ.
-//! (Pressed by half of its height, a block gives way by 0.1 % more. Cubes that are turned inside out come back.)
+//! **Limits.** The law stiffens as λ|cof F|², and as μ|F|. So that a substep that is stable at rest stays stable however far
+//! the tissue is pressed or pulled, W = μ(½|H|² + tr H) + ψ has in place of ψ = ½(λ + μ)(J − 1)² − μ(J − 1)
+//!
+//! g·ψ, g = min(1, S/s), s = |cof F|², with S = [`SOFTENS`],
+//!
+//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2gψ/s·(|F|²F − F·Fᵀ·F) where
+//! g < 1. (A force that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside
+//! out.) Pressed by half of its height, a block gives way as without limits.
 #![allow(clippy::needless_range_loop)]
 
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
-/// |cof F|² from which on the pressure is reduced; 3 at rest.
+/// |cof F|² from which on ψ is reduced; 3 at rest.
 const SOFTENS: f64 = 3.5;
 
 /// The largest pressure, in μ.
@@ -43,6 +48,8 @@ pub(crate) struct NeoHookean<T> {
     shear: T,
     /// c·(λ + μ)/E/4, the factor of 64(J − 1) in 16 times the pressure.
     bulk: T,
+    /// 64|J − 1| beyond which the pressure stays the same.
+    largest_growth: T,
 }
 
 /// One component of the force of a cube on the rows of its corners along x: near in y and z, far in y, far in z, far in
@@ -124,7 +131,28 @@ impl<T: Real> NeoHookean<T> {
     /// scheme's units of force.
     pub(crate) fn new(stiffness: f64, shear: f64, lame: f64) -> Self {
         let unit = stiffness / 64.0;
-        NeoHookean { shear: T::of(unit * shear), bulk: T::of(unit * (lame + shear) / 4.0) }
+        NeoHookean {
+            shear: T::of(unit * shear),
+            bulk: T::of(unit * (lame + shear) / 4.0),
+            largest_growth: T::of(64.0 * LARGEST * shear / (lame + shear)),
+        }
+    }
+
+    /// Returns 64(J − 1) as far as the pressure grows with it.
+    #[inline(always)]
+    fn growing<V: Vector<Real = T>>(&self, growth: V) -> V {
+        let (largest, zero) = (growth.splat(self.largest_growth), growth.splat(T::default()));
+        let least = zero.sub(largest);
+        // The smaller of two is minus the larger of both turned round.
+        zero.sub(zero.sub(growth).larger(least)).larger(least)
+    }
+
+    /// Returns 64 ψ without g, with c in it; `pressure` is 16 times the pressure for `growing`.
+    #[inline(always)]
+    fn psi<V: Vector<Real = T>>(growth: V, growing: V, pressure: V, shear: V) -> V {
+        let of = |value: f64| growth.splat(T::of(value));
+        let stored = pressure.mul(of(0.0625)).mul(growth.minus(of(0.5), growing));
+        stored.minus(shear, growth)
     }
 
     /// Returns what cubes of weight `w` pull with.
@@ -133,10 +161,22 @@ impl<T: Real> NeoHookean<T> {
         let shear = w.mul(w.splat(self.shear));
         let bulk = w.mul(w.splat(self.bulk));
         let (cofactor, trace, growth) = invariants(h);
-        let pressure = limited(&cofactor, trace, bulk.mul(growth), shear);
-        // 16 P, all times the weight: 4μ·h + q·(cof h − 4hᵀ) + (16 p + 4 q·tr h)·I, here q = p − μ and `pressure` 16 p.
-        let (sixteenth, four) = (w.splat(T::of(0.0625)), w.splat(T::of(4.0)));
-        let q = pressure.mul(sixteenth).sub(shear);
+        let growing = self.growing(growth);
+        let (mut pressure, sixteenth, four) = (bulk.mul(growing), w.splat(T::of(0.0625)), w.splat(T::of(4.0)));
+        let mut q = pressure.mul(sixteenth).sub(shear);
+        let (squares, most) = (squares(&cofactor, trace), w.splat(T::of(256.0 * SOFTENS)));
+        let is_far = squares.above(most);
+        let mut far = None;
+        if V::any(is_far) {
+            let psi = Self::psi(growth, growing, pressure, shear);
+            let part = most.div(squares.larger(most));
+            let sixteen = w.splat(T::of(16.0));
+            q = V::select(is_far, q.mul(part), q);
+            pressure = V::select(is_far, sixteen.mul(q.add(shear)), pressure);
+            far = Some(part.mul(psi).mul(w.splat(T::of(-2.0))).div(squares));
+        }
+        // 16 P, all times the weight: 4μ·h + q·(cof h − 4hᵀ) + (16 (q + μ) + 4 q·tr h)·I, where q is g·ψ′ and `pressure`
+        // 16 (q + μ).
         let (shear_four, q_four) = (shear.mul(four), q.mul(four));
         let spherical = q_four.mul_add(trace, pressure);
         let mut p = [[w; 3]; 3];
@@ -147,33 +187,45 @@ impl<T: Real> NeoHookean<T> {
                 p[c][along] = q.mul_add(cofactor[c][along], own);
             }
         }
+        if let Some(factor) = far {
+            let turned = across(h);
+            for c in 0..3 {
+                for along in 0..3 {
+                    let more = factor.mul_add(turned[c][along], p[c][along]);
+                    p[c][along] = V::select(is_far, more, p[c][along]);
+                }
+            }
+        }
         Stress::of(p, shear)
     }
 
-    /// Returns the energy of cubes, in the scheme's units of force times edges: that of [`NeoHookean::stress`], with the
-    /// reduced pressure.
+    /// Returns the energy of cubes, in the scheme's units of force times edges.
     #[inline(always)]
     pub(crate) fn energy<V: Vector<Real = T>>(&self, w: V, Patterns { h, g }: &Patterns<V>) -> V {
         let shear = w.mul(w.splat(self.shear));
         let bulk = w.mul(w.splat(self.bulk));
         let (cofactor, trace, growth) = invariants(h);
         let zero = w.splat(T::default());
-        let (mut squares, mut hours, mut last) = (zero, zero, zero);
+        let (mut of_squares, mut hours, mut last) = (zero, zero, zero);
         for c in 0..3 {
             for along in 0..3 {
-                squares = h[c][along].mul_add(h[c][along], squares);
+                of_squares = h[c][along].mul_add(h[c][along], of_squares);
                 hours = g[c][along].mul_add(g[c][along], hours);
             }
             last = g[c][3].mul_add(g[c][3], last);
         }
         // 64(J − 1) = 16 tr h + 4 tr cof h + det h: so what is subtracted, 4 tr cof h + det h, is this less 16 tr h.
         let less = growth.sub(w.splat(T::of(16.0)).mul(trace));
-        let of_h = w.splat(T::of(2.0)).mul_add(squares, zero.sub(less));
+        let of_h = w.splat(T::of(2.0)).mul_add(of_squares, zero.sub(less));
         let of_g = w.splat(T::of(4.0 / 3.0)).mul_add(hours, w.splat(T::of(2.0 / 3.0)).mul(last));
-        let pressure = limited(&cofactor, trace, bulk.mul(growth), shear);
-        // ½ p·64(J − 1), where 16 p is known, and with c in it: ½·(16 p)·64(J − 1)/16.
-        let swelling = pressure.mul(growth).mul(w.splat(T::of(1.0 / 32.0)));
-        shear.mul_add(of_h.add(of_g), swelling)
+        let growing = self.growing(growth);
+        let pressure = bulk.mul(growing);
+        // ψ + μ(J − 1), without the difference of large numbers at small h; then (g − 1)·ψ.
+        let swelling = pressure.mul(w.splat(T::of(0.0625))).mul(growth.minus(w.splat(T::of(0.5)), growing));
+        let most = w.splat(T::of(256.0 * SOFTENS));
+        let less = most.div(squares(&cofactor, trace).larger(most)).sub(w.splat(T::of(1.0)));
+        let reduced = less.mul(Self::psi(growth, growing, pressure, shear));
+        shear.mul_add(of_h.add(of_g), swelling.add(reduced))
     }
 }
 
@@ -202,9 +254,9 @@ pub(super) fn invariants<V: Vector>(h: &[[V; 3]; 3]) -> ([[V; 3]; 3], V, V) {
     (cofactor, trace, growth)
 }
 
-/// Returns 16 times a pressure, reduced and limited. `cofactor` and `trace` are those of [`invariants`].
+/// Returns 256|cof F|². `cofactor` and `trace` are those of [`invariants`].
 #[inline(always)]
-fn limited<V: Vector>(cofactor: &[[V; 3]; 3], trace: V, pressure: V, shear: V) -> V {
+fn squares<V: Vector>(cofactor: &[[V; 3]; 3], trace: V) -> V {
     let of = |value: f64| trace.splat(V::Real::of(value));
     // 16 cof F = 16 + 4 tr h on the diagonal, and the rest.
     let diagonal = of(4.0).mul_add(trace, of(16.0));
@@ -215,10 +267,35 @@ fn limited<V: Vector>(cofactor: &[[V; 3]; 3], trace: V, pressure: V, shear: V) -
             squares = value.mul_add(value, squares);
         }
     }
-    let most = of(256.0 * SOFTENS);
-    let pressure = pressure.mul(most.div(squares.larger(most)));
-    let largest = of(16.0 * LARGEST).mul(shear);
-    let zero = of(0.0);
-    let above = pressure.larger(zero.sub(largest));
-    zero.sub(zero.sub(above).larger(zero.sub(largest)))
+    squares
+}
+
+/// Returns |A|²A − A·Aᵀ·A of A = 4F = 4 + h: half the derivative of |cof A|².
+#[inline(always)]
+fn across<V: Vector>(h: &[[V; 3]; 3]) -> [[V; 3]; 3] {
+    let (zero, four) = (h[0][0].splat(V::Real::default()), h[0][0].splat(V::Real::of(4.0)));
+    let mut a = *h;
+    for c in 0..3 {
+        a[c][c] = h[c][c].add(four);
+    }
+    let mut products = [[zero; 3]; 3];
+    for i in 0..3 {
+        for j in 0..3 {
+            for c in 0..3 {
+                products[i][j] = a[c][i].mul_add(a[c][j], products[i][j]);
+            }
+        }
+    }
+    let whole = products[0][0].add(products[1][1]).add(products[2][2]);
+    let mut turned = [[zero; 3]; 3];
+    for c in 0..3 {
+        for along in 0..3 {
+            let mut value = whole.mul(a[c][along]);
+            for k in 0..3 {
+                value = value.minus(a[c][k], products[k][along]);
+            }
+            turned[c][along] = value;
+        }
+    }
+    turned
 }

@@ -3,14 +3,15 @@
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_geometry::cell_surface::surface_of;
 use palpate_geometry::fill::{Lattice, filled};
 use palpate_geometry::subdivide::subdivide;
-use palpate_geometry::{Group, TriangleMesh, report};
+use palpate_geometry::{Group, TriangleMesh, prepare, report};
 
 use super::fixed::{FixedPart, along_axis};
 use crate::limits::Limits;
 use crate::scene::mesh::{MeshShape, group_named};
-use crate::scene::shown::Simulated;
+use crate::scene::shown::findings_of;
 use crate::shape::{CellPlace, Deepest, Extent, PointId, PointName, RestShape, ShownShape};
 use palpate_refusal::{Reason, Refusal, Result, legible};
 
@@ -73,12 +74,11 @@ impl SolidShape {
     /// Fills a closed surface with cubes, and finds the fixed points.
     ///
     /// # Errors
-    /// Refuses a mesh that is not a closed surface, with a place of a hole (empty field); cubes that are larger than the
+    /// Refuses a mesh that does not enclose a space, with a place of a hole (empty field); cubes that are larger than the
     /// surface, or more than the limits allow (field `cell_m`); and a fixed part without a point (field `solid.fixed`).
     pub fn of(source: TriangleMesh, size: CellSize, fixed: &[FixedPart], limits: &Limits) -> Result<Self> {
         let refuse = |message: String| Refusal::new(Reason::Unreadable, "", message);
-        let Simulated { mut mesh, findings, .. } =
-            Simulated::of(source.clone(), None, false).map_err(|refusal| refuse(refusal.message))?;
+        let Enclosing { mut mesh, is_surface, mut findings } = Enclosing::of(source.clone())?;
         let extent = Extent::around(mesh.vertices_m.iter().copied());
         let edge_m = match size {
             CellSize::Edge(edge_m) => edge_m,
@@ -102,6 +102,13 @@ impl SolidShape {
         }
         if found.parts.iter().all(|part| *part == 0.0) {
             return Err(refuse("encloses nothing".to_owned()));
+        }
+        if !is_surface {
+            findings.push(format!(
+                "mesh: its triangles form no surface, so one is made around what they enclose, to {} m",
+                legible(0.5 * edge_m)
+            ));
+            mesh = rebuilt(&mesh, &lattice);
         }
         let most = MAX_VERTICES.max(mesh.vertices_m.len());
         subdivide(&mut mesh, 0.5 * edge_m, most);
@@ -350,6 +357,52 @@ impl SolidShape {
         }
         from
     }
+}
+
+/// Triangles that enclose a space.
+struct Enclosing {
+    mesh: TriangleMesh,
+    /// Whether they form a surface, each edge of which has two of them.
+    is_surface: bool,
+    /// What was done with the mesh of the scene, and doubts about it.
+    findings: Vec<String>,
+}
+
+impl Enclosing {
+    /// Joins the triangles of a mesh, and turns them outward as far as they form surfaces.
+    ///
+    /// # Errors
+    /// Refuses a mesh without a triangle that has an area, and one with a wrong number (empty field).
+    fn of(mesh: TriangleMesh) -> Result<Self> {
+        let prepared = prepare(mesh);
+        let report = prepared.report();
+        let mut refused = report.problems.iter().filter(|finding| finding.problem.is_refused());
+        if let Some(finding) = refused.clone().find(|finding| !finding.problem.is_of_joints()) {
+            let message = format!("{finding}; `palpate mesh FILE --repair` may mend it");
+            return Err(Refusal::new(Reason::Unreadable, "", message));
+        }
+        let is_surface = refused.next().is_none();
+        Ok(Enclosing { findings: findings_of(&prepared.notes, &report), mesh: prepared.mesh, is_surface })
+    }
+}
+
+/// Returns the surface around what triangles enclose, to half a cube of a lattice, with the groups of the triangles: the
+/// vertex nearest to each of theirs.
+#[allow(clippy::cast_possible_truncation)]
+fn rebuilt(mesh: &TriangleMesh, lattice: &Lattice) -> TriangleMesh {
+    let finer = Lattice { edge_m: 0.5 * lattice.edge_m, cells: lattice.cells.map(|cells| 2 * cells), ..*lattice };
+    let mut surface = surface_of(&filled(&mesh.vertices_m, &mesh.triangles, &finer).parts, &finer);
+    let Ok(places) = MeshShape::new(surface.vertices_m.clone(), surface.triangles.clone(), |_, _, _| false) else {
+        return surface;
+    };
+    for group in &mesh.groups {
+        let nearest = |vertex: &u32| nearest_vertex(&places, mesh.vertices_m[*vertex as usize]);
+        let mut vertices: Vec<u32> = group.vertices.iter().map(nearest).collect();
+        vertices.sort_unstable();
+        vertices.dedup();
+        surface.groups.push(Group { name: group.name.clone(), vertices });
+    }
+    surface
 }
 
 /// Returns the vertex of a surface nearest to a place, m: a corner of the nearest triangle.

@@ -1,0 +1,261 @@
+//! Solids: the time of a step, and touch against solutions of other methods. Writes docs/benchmarks/solid.{md,svg}.
+//! `-- --quick` measures less.
+
+#![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
+
+mod report;
+
+use std::fmt::Write as _;
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+use palpate_haptics::Tip;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::response::mesh_error::MeshError;
+use palpate_tissue::response::tangent;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::{Model, Push, Tissue, at_rest};
+use report::chart::{Look, Panel, Series};
+use report::{BenchReport, cells, digits, least, quick, seconds};
+use serde_json::json;
+
+/// Radius of the disc, m.
+const RADIUS_M: f64 = 0.005;
+
+/// The block of the references, m.
+const BLOCK_M: DVec3 = DVec3::new(0.06, 0.06, 0.03);
+
+/// Force over mean depth of an even pressure on the middle of the block, N/m: quadratic elements with linear
+/// discontinuous pressure, within 0.1 % under refinement.
+const STIFFNESS_N_PER_M: [(f64, f64); 3] = [(0.45, 107.37), (0.49, 113.24), (0.495, 114.05)];
+
+/// Force at some depths, N (four times that on a quarter of the block): quadratic elements with the law of a solid.
+const DEEP_N: [(f64, f64); 4] =
+    [(0.5e-3, 4.0 * 13.214e-3), (1e-3, 4.0 * 25.828e-3), (1.5e-3, 4.0 * 37.638e-3), (2e-3, 4.0 * 48.434e-3)];
+
+/// Stiffness with a lump of radius 5 mm, five times as stiff, 10 mm deep in the block of ν = 0.49, divided by that without.
+const LUMP: f64 = 1.170;
+
+/// The corners of a box and its triangles as an OBJ file, m, each place moved by `moved`.
+fn box_obj(size_m: DVec3, moved: impl Fn(DVec3) -> DVec3) -> String {
+    let mut text = String::new();
+    for n in 0..8 {
+        let corner = DVec3::from_array([0, 1, 2].map(|axis| f64::from(n >> axis & 1))) * size_m;
+        let at = moved(corner);
+        let _ = writeln!(text, "v {:?} {:?} {:?}", at.x, at.y, at.z);
+    }
+    for [a, b, c, d] in [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]] {
+        let _ = writeln!(text, "f {} {} {}\nf {} {} {}", a + 1, b + 1, c + 1, a + 1, c + 1, d + 1);
+    }
+    text
+}
+
+/// A block in a lattice of cubes of `cell_m`, turned by `turn`, held at its lowest face.
+fn block(size_m: DVec3, cell_m: f64, nu: f64, turn: DQuat, more: &str) -> Arc<Model> {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("block.obj"), box_obj(size_m, |at| turn * at)).unwrap();
+    let normal = (turn * DVec3::Z).to_array();
+    let text = format!(
+        "[solid]\nfile = \"block.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
+         fixed = [{{ plane_m = [0, 0, 0], normal = {normal:?}, within_m = 0.0 }}]\n\
+         [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = {nu:?}\ndamping_per_s = 100\n{more}\n\
+         [stepping]\nintegrator = \"central\"\nsubsteps = {}\n[sleep]\ntolerance = 0\n",
+        substeps(cell_m, nu)
+    );
+    let scene = Scene::parse_in(folder.path(), "block", &text, &[], &Limits::default()).unwrap();
+    Model::compile(&scene, &Limits::default()).unwrap()
+}
+
+/// Substeps of a millisecond at which dt·ω is 1.5 by the bound ω² = 4·(3λ + 2μ)/(ρ·a²).
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn substeps(cell_m: f64, nu: f64) -> u32 {
+    let (lame, shear) = (nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), 0.5 / (1.0 + nu));
+    let omega_per_s = (4.0 * 8e3 * (3.0 * lame + 2.0 * shear) / 1060.0).sqrt() / cell_m;
+    (1e-3 * omega_per_s / 1.5).ceil() as u32
+}
+
+/// Stiffness under a small press of the disc, N/m.
+fn stiffness(model: &Model, at_m: DVec3) -> f64 {
+    tangent::press(model, RADIUS_M, at_m, 0.0, 1)[0].tangent.stiffness_n_per_m.z_axis.z
+}
+
+fn percent(ratio: f64) -> String {
+    format!("{:+.1} %", 100.0 * (ratio - 1.0))
+}
+
+fn main() {
+    let mut report = BenchReport::new("solid", "Solids", "make bench-solid");
+    report.say(
+        "Release build, one thread. Times are the shortest of many runs, in which the rows of a table take turns.",
+    );
+    speed(&mut report);
+    let errors = touch(&mut report);
+    deep(&mut report);
+    lumps(&mut report);
+    report.write(1, &[errors]);
+}
+
+fn speed(report: &mut BenchReport) {
+    report.heading("Time of a substep");
+    report.say(
+        "Blocks of cubes of 3 mm, 8 kPa, ν = 0.45, with a poke that moves every point: `central`, f32, all awake, the whole step \
+         with its guard.",
+    );
+    let sides: &[[f64; 3]] =
+        if quick() { &[[15.0, 15.0, 14.0]] } else { &[[15.0, 15.0, 14.0], [27.0, 27.0, 26.0], [47.0, 47.0, 43.0]] };
+    let cell_m = 0.003;
+    let tissues: Vec<_> = sides
+        .iter()
+        .map(|side| {
+            let size_m = cell_m * DVec3::from_array(*side);
+            let model = block(size_m, cell_m, 0.45, DQuat::IDENTITY, "");
+            let mut tissue = at_rest(&model);
+            let force_n = DVec3::new(0.0, 0.0, -1e-5);
+            let poke = Poke { point: None, centre_m: 0.5 * size_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 };
+            tissue.push(0, Some(Push::Constant(poke)));
+            (0..20).for_each(|_| tissue.step().unwrap());
+            std::cell::RefCell::new(tissue)
+        })
+        .collect();
+    let steps = 5;
+    let times_s = least(if quick() { 5 } else { 30 }, &tissues, |tissue| {
+        let mut tissue = tissue.borrow_mut();
+        seconds(|| (0..steps).for_each(|_| tissue.step().unwrap())).0 / f64::from(steps)
+    });
+    let mut rows = Vec::new();
+    for (tissue, time_s) in tissues.iter().zip(times_s) {
+        let tissue = tissue.borrow();
+        let (model, points) = (tissue.model(), tissue.model().len());
+        let ns = 1e9 * time_s / (points as f64 * f64::from(model.plan.substeps));
+        rows.push(cells([
+            points.to_string(),
+            model.plan.substeps.to_string(),
+            digits(ns),
+            digits(1e6 * time_s),
+            digits(100.0 * time_s * model.scene.stepping.rate_hz),
+        ]));
+        report.figure(&format!("{points} points"), json!({ "ns": ns, "step_us": 1e6 * time_s }));
+    }
+    let header = ["points", "substeps", "ns a point and substep", "µs a step", "% of a core at 1 kHz"];
+    report.table(&header.map(str::to_owned), &rows);
+}
+
+/// The error of stiffness by the size of cubes, at five places and turned.
+fn touch(report: &mut BenchReport) -> Panel {
+    report.heading("Touch");
+    report.say(
+        "A disc of 5 mm with even pressure on the middle of a block of 60 × 60 × 30 mm that is held below, 8 kPa: the error of \
+         its stiffness against a solution with quadratic elements (ν = 0.45: 107.37, 0.49: 113.24, 0.495: 114.05 N/m). Moved: the \
+         least and the largest of five places of the disc, up to half a cube along x and y; the truth of the middle serves for all. \
+         Turned: the block by 20° about x and 30° about z in the lattice. Estimate: what `palpate check` says, divided by the \
+         error in the middle.",
+    );
+    let sizes_m: &[f64] = if quick() { &[0.005] } else { &[0.005, 0.00375, 0.003, 0.0025] };
+    let middle_m = DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z);
+    let turn = DQuat::from_rotation_z(30_f64.to_radians()) * DQuat::from_rotation_x(20_f64.to_radians());
+    let (mut rows, mut in_line, mut turned_errors) = (Vec::new(), Vec::new(), Vec::new());
+    for (nu, truth) in STIFFNESS_N_PER_M {
+        for cell_m in sizes_m.iter().copied() {
+            let model = block(BLOCK_M, cell_m, nu, DQuat::IDENTITY, "");
+            let ratios = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.25, 0.25], [0.25, 0.5]]
+                .map(|[x, y]| stiffness(&model, middle_m + cell_m * DVec3::new(x, y, 0.0)) / truth);
+            let least = ratios.iter().copied().fold(f64::INFINITY, f64::min);
+            let largest = ratios.iter().copied().fold(0.0, f64::max);
+            let turned = block(BLOCK_M, cell_m, nu, turn, "");
+            let turned_ratio = stiffness(&turned, turn * middle_m) / truth;
+            let estimate = MeshError::of(&model, Disc { radius_m: RADIUS_M, at_m: middle_m });
+            let estimated = estimate.map_or(f64::NAN, |estimate| estimate.relative / (ratios[0] - 1.0));
+            rows.push(cells([
+                nu.to_string(),
+                digits(1e3 * cell_m),
+                model.len().to_string(),
+                percent(ratios[0]),
+                format!("{} … {}", percent(least), percent(largest)),
+                percent(turned_ratio),
+                digits(estimated),
+            ]));
+            report.figure(
+                &format!("nu {nu} cell {cell_m}"),
+                json!({ "in_line": ratios[0] - 1.0, "least": least - 1.0, "largest": largest - 1.0,
+                    "turned": turned_ratio - 1.0, "estimate": estimated }),
+            );
+            if nu == 0.45 {
+                in_line.push((1e3 * cell_m, 100.0 * (ratios[0] - 1.0)));
+                turned_errors.push((1e3 * cell_m, 100.0 * (turned_ratio - 1.0)));
+            }
+        }
+    }
+    let header = ["ν", "cubes, mm", "points", "in the middle", "moved", "turned", "estimate ÷ error"];
+    report.table(&header.map(str::to_owned), &rows);
+    let most = in_line.iter().chain(&turned_errors).map(|at| at.1).fold(0.0, f64::max);
+    let series = |name: &str, hue, points| Series { name: name.to_owned(), hue, look: Look::Full, points };
+    Panel::Curves {
+        title: "Error of stiffness under a disc of 5 mm, ν = 0.45".to_owned(),
+        x: "mm, edge of a cube",
+        y: "%",
+        up: 0.0..1.1 * most,
+        series: vec![series("in line", 0, in_line), series("turned", 1, turned_errors)],
+    }
+}
+
+/// Presses slowly to some depths.
+fn deep(report: &mut BenchReport) {
+    report.heading("Deep touch");
+    report.say(
+        "The same block, ν = 0.45, pressed at 10 mm/s: the force against that of quadratic elements with the same law at four \
+         depths, of which 2.5 mm is half of the disc's radius.",
+    );
+    let sizes_m: &[f64] = if quick() { &[0.005] } else { &[0.005, 0.00375, 0.003, 0.0025] };
+    let mut rows = Vec::new();
+    for cell_m in sizes_m.iter().copied() {
+        let model = block(BLOCK_M, cell_m, 0.45, DQuat::IDENTITY, "");
+        let mut tissue = at_rest(&model);
+        let mut errors = Vec::new();
+        let mut depth_m = 0.0;
+        for (to_m, truth_n) in DEEP_N {
+            while depth_m < to_m {
+                depth_m = (depth_m + 1e-5_f64).min(to_m);
+                press(&mut *tissue, depth_m);
+            }
+            (0..150).for_each(|_| press(&mut *tissue, depth_m));
+            errors.push(percent(tissue.tool_contact(0).unwrap().force_on_tool_n.z / truth_n));
+        }
+        rows.push([vec![digits(1e3 * cell_m)], errors].concat());
+    }
+    report.table(&["cubes, mm", "0.5 mm deep", "1 mm", "1.5 mm", "2 mm"].map(str::to_owned), &rows);
+}
+
+fn press(tissue: &mut dyn Tissue, depth_m: f64) {
+    let tip = Tip { radius_m: RADIUS_M, friction: 0.0, ..Tip::default() };
+    tissue.pose(0, DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z - depth_m), tip);
+    tissue.step().unwrap();
+}
+
+fn lumps(report: &mut BenchReport) {
+    report.heading("Lumps");
+    report.say(
+        "The same block, ν = 0.49, with a lump of radius 5 mm, five times as stiff: stiffness over its middle, divided by that \
+         without the lump. Quadratic elements: 1.170 at 10 mm; there is no such solution for the other depths.",
+    );
+    let sizes_m: &[f64] = if quick() { &[0.005] } else { &[0.005, 0.00375, 0.003, 0.0025] };
+    let middle_m = DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z);
+    let mut rows = Vec::new();
+    for cell_m in sizes_m.iter().copied() {
+        let without = stiffness(&block(BLOCK_M, cell_m, 0.49, DQuat::IDENTITY, ""), middle_m);
+        let ratios = [0.008, 0.010, 0.015].map(|depth_m| {
+            let centre_m = (middle_m - depth_m * DVec3::Z).to_array();
+            let lump = format!("[[inclusion]]\ncentre_m = {centre_m:?}\nradius_m = 0.005\nstiffness_factor = 5\n");
+            stiffness(&block(BLOCK_M, cell_m, 0.49, DQuat::IDENTITY, &lump), middle_m) / without
+        });
+        rows.push(cells([
+            digits(1e3 * cell_m),
+            format!("{:.3}", ratios[0]),
+            format!("{:.3} ({})", ratios[1], percent(ratios[1] / LUMP)),
+            format!("{:.3}", ratios[2]),
+        ]));
+        report.figure(&format!("lump cell {cell_m}"), json!(ratios));
+    }
+    report.table(&["cubes, mm", "8 mm deep", "10 mm", "15 mm"].map(str::to_owned), &rows);
+}

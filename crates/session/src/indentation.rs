@@ -1,0 +1,178 @@
+//! Indentation: a tip goes straight into the tissue and back, and its force over its depth is told as papers print it.
+
+use std::fmt::Write as _;
+use std::path::Path;
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate_refusal::Result;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::record::Summary;
+use palpate_tissue::scene::script::Script;
+use palpate_tissue::{Footprint, Model};
+
+use super::run::{RunEvent, RunOptions, run_with};
+use super::simulation::SimulationFailure;
+
+/// Distance from the tissue at which the tip begins and ends, divided by its radius.
+const CLEARANCE: f64 = 0.1;
+
+/// Time for which the tip stays at its depth, s.
+const REST_S: f64 = 0.2;
+
+/// Time between two samples, s.
+const SAMPLE_S: f64 = 0.005;
+
+/// Number of depths of a curve, the first (0) left out.
+const DEPTHS: usize = 20;
+
+/// A tip that goes straight into the tissue and back.
+#[derive(Debug, Clone, Copy)]
+pub struct Indentation {
+    /// Where it goes in, m: the nearest place of the rest surface. `None` for the place that stands for the tissue.
+    pub place_m: Option<DVec3>,
+    /// Radius of the tip, m: an even pressure on this disc.
+    pub radius_m: f64,
+    /// Largest depth, m, the mean over the disc.
+    pub depth_m: f64,
+    /// Mean speed on the way in and back, m/s.
+    pub speed_m_per_s: f64,
+}
+
+/// Force at one depth of an indentation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthForce {
+    /// Depth of the tip, the mean over its disc, m.
+    pub depth_m: f64,
+    /// Outward force of the tissue on the tip on the way in, N.
+    pub loading_n: f64,
+    /// The same on the way back, N.
+    pub unloading_n: f64,
+}
+
+/// The result of an indentation.
+#[derive(Debug, Clone)]
+pub struct Indented {
+    /// The place of the rest surface where the tip went in, m.
+    pub place_m: DVec3,
+    /// Force at 21 depths, evenly from 0 to the largest that was reached.
+    pub curve: Vec<DepthForce>,
+    /// Force divided by depth over the first tenth of the way in, N/m.
+    pub stiffness_n_per_m: f64,
+    /// The summary of the run.
+    pub summary: Summary,
+}
+
+impl Indentation {
+    /// Returns Young's modulus of the half space that would be as stiff under a disc of even pressure,
+    /// E = 16·(1 − ν²)·k/(3π²·a) with k = F/ū (Timoshenko and Goodier, Theory of Elasticity, section 139), Pa.
+    pub fn apparent_modulus_pa(&self, stiffness_n_per_m: f64, poissons_ratio: f64) -> f64 {
+        let nu = poissons_ratio;
+        16.0 * (1.0 - nu * nu) * stiffness_n_per_m / (3.0 * std::f64::consts::PI.powi(2) * self.radius_m)
+    }
+
+    /// Returns the script of the indentation: its only tool is the tip.
+    ///
+    /// # Errors
+    /// Refuses a tip that does not suit the tissue, with the fields of a script.
+    fn script(&self, model: &Model, limits: &Limits) -> Result<(Script, DVec3, DVec3)> {
+        let (place_m, outward) = self.on_surface(model);
+        let away_m = CLEARANCE * self.radius_m;
+        let at = |out_m: f64| (place_m + out_m * outward).to_array();
+        let [down_s, rest_s, up_s] = self.times_s();
+        let mut text = format!("name = \"indent\"\nduration_s = {up_s:?}\nsample_every_s = {SAMPLE_S}\n\n[[tool]]\n");
+        let _ = write!(text, "tip = {{ radius_m = {:?}, friction = 0.0 }}\nposes = [\n", self.radius_m);
+        for (at_s, out_m) in [(0.0, away_m), (down_s, -self.depth_m), (rest_s, -self.depth_m), (up_s, away_m)] {
+            let _ = writeln!(text, "    {{ at_s = {at_s:?}, place_m = {:?} }},", at(out_m));
+        }
+        text += "]\n";
+        Ok((Script::parse("indent", &text, Path::new(""), &model.scene, limits)?, place_m, outward))
+    }
+
+    /// Returns the place of the rest surface where the tip goes in, m, and the direction out of the tissue there.
+    fn on_surface(&self, model: &Model) -> (DVec3, DVec3) {
+        let wanted_m = self.place_m.unwrap_or_else(|| model.shape().pressed_m());
+        let footprint = Footprint::new(model, self.radius_m, wanted_m);
+        footprint.at_rest()
+    }
+
+    /// Returns the times at which the tip has arrived at its depth, leaves it, and is back, s.
+    fn times_s(&self) -> [f64; 3] {
+        // The tissue takes a while to come to rest around a tip that has stopped.
+        let way_s = (self.depth_m + CLEARANCE * self.radius_m) / self.speed_m_per_s;
+        [way_s, way_s + REST_S, 2.0 * way_s + REST_S]
+    }
+
+    /// Returns the number of steps at a rate (Hz).
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn steps(&self, rate_hz: f64) -> u64 {
+        (self.times_s()[2] * rate_hz).round() as u64
+    }
+
+    /// Runs the indentation on `model` from rest, as fast as possible. `clock_s` returns a monotonic time, s; `progress` is
+    /// called with the number of steps done.
+    ///
+    /// # Errors
+    /// Returns the errors of [`run`](super::run::run), and refuses a tip that does not suit the tissue.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn run(
+        &self,
+        model: &Arc<Model>,
+        limits: &Limits,
+        clock_s: &dyn Fn() -> f64,
+        progress: &mut dyn FnMut(u64),
+    ) -> std::result::Result<Indented, SimulationFailure> {
+        let (script, place_m, outward) = self.script(model, limits).map_err(SimulationFailure::Refused)?;
+        let mut samples: Vec<(f64, f64)> = Vec::new();
+        let options = RunOptions::default();
+        let summary = run_with(model, &script, options, limits, clock_s, &mut |event| {
+            match event {
+                RunEvent::Record(record) => {
+                    let sample = record.tools.first().map(|tool| {
+                        let depth_m = -outward.dot(DVec3::from_array(tool.place_m) - place_m);
+                        (depth_m, outward.dot(DVec3::from_array(tool.force_on_tool_n)))
+                    });
+                    samples.extend(sample);
+                }
+                RunEvent::Steps(steps) => progress(steps),
+                RunEvent::Run(_) | RunEvent::Summary(_) => {}
+            }
+            Ok(())
+        })?;
+        let deepest = (0..samples.len()).max_by(|a, b| samples[*a].0.total_cmp(&samples[*b].0)).unwrap_or(0);
+        let last_deepest =
+            samples.iter().rposition(|sample| sample.0 >= samples[deepest].0 * (1.0 - 1e-6)).unwrap_or(0);
+        let (loading, unloading) = (&samples[..=deepest.min(samples.len() - 1)], &samples[last_deepest..]);
+        let largest_m = samples.get(deepest).map_or(0.0, |sample| sample.0.max(0.0));
+        let curve: Vec<DepthForce> = (0..=DEPTHS)
+            .map(|k| {
+                let depth_m = largest_m * k as f64 / DEPTHS as f64;
+                DepthForce {
+                    depth_m,
+                    loading_n: at_depth(loading.iter(), depth_m),
+                    unloading_n: at_depth(unloading.iter().rev(), depth_m),
+                }
+            })
+            .collect();
+        let tenth = curve[DEPTHS / 10];
+        let stiffness_n_per_m = if tenth.depth_m > 0.0 { tenth.loading_n / tenth.depth_m } else { 0.0 };
+        Ok(Indented { place_m, curve, stiffness_n_per_m, summary })
+    }
+}
+
+/// Returns the force at a depth, between samples of ascending depth.
+fn at_depth<'s>(samples: impl Iterator<Item = &'s (f64, f64)>, depth_m: f64) -> f64 {
+    let mut before: Option<(f64, f64)> = None;
+    for (at_m, force_n) in samples.copied() {
+        if at_m >= depth_m {
+            return match before {
+                Some((below_m, below_n)) if at_m > below_m => {
+                    below_n + (force_n - below_n) * (depth_m - below_m) / (at_m - below_m)
+                }
+                _ => force_n,
+            };
+        }
+        before = Some((at_m, force_n));
+    }
+    before.map_or(0.0, |(_, force_n)| force_n)
+}
