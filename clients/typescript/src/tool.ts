@@ -48,6 +48,8 @@ export class Tool {
   private callMs: number | undefined;
   private leaseId: string | undefined;
   private taking: Promise<boolean> | undefined;
+  /** The release of the last lease, while the server has not answered it: until then the tool is still taken. */
+  private leaving: Promise<void> | undefined;
   private sequence = 0n;
   /** The sequence from which datagrams count, while poses are sent by datagram. */
   private from: bigint | undefined;
@@ -101,6 +103,7 @@ export class Tool {
     const { sessionId, tool, holder } = this;
     try {
       const call = { timeoutMs: CALL_TIMEOUT_MS };
+      await this.leaving;
       const { leaseId } = await this.server.haptics.acquireTool({ sessionId, tool, leaseS: LEASE_S, holder }, call);
       this.leaseId = leaseId;
       this.sequence = 0n;
@@ -157,11 +160,13 @@ export class Tool {
     this.wanted = undefined;
     this.lost();
     if (!leaseId) return;
-    try {
-      await this.server.haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: CALL_TIMEOUT_MS });
-    } catch {
-      // The lease expires by itself, which ends the tool's action.
-    }
+    // If that fails, the lease expires by itself, which ends the tool's action.
+    const released = this.server.haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: CALL_TIMEOUT_MS });
+    this.leaving = released.then(
+      () => {},
+      () => {},
+    );
+    await this.leaving;
   }
 
   private lost(): void {

@@ -7,7 +7,6 @@ use std::sync::Arc;
 use palpate_geometry::TriangleMesh;
 
 use super::graph::MeshGraph;
-use super::material::Inclusion;
 use super::profile::Poke;
 use super::source::Files;
 use super::springs::Springs;
@@ -74,9 +73,9 @@ pub(super) trait KindOfBody: BodyKind + Sized {
         None
     }
 
-    /// Returns the same tissue with cells of `cell_m` (m) and these inclusions. `None` for a tissue without cells, and if
-    /// such cells do not fit.
-    fn with_cells(&self, _inclusions: &[Inclusion], _cell_m: f64) -> Option<Self> {
+    /// Returns the same tissue with cells of `cell_m` (m), without inclusions. `None` for a tissue without cells, and if such
+    /// cells do not fit.
+    fn with_cells(&self, _cell_m: f64) -> Option<Self> {
         None
     }
 }

@@ -187,9 +187,9 @@ macro_rules! kinds {
                 }
             }
 
-            fn with_cells(&self, inclusions: &[Inclusion], cell_m: f64) -> Option<Body> {
+            fn with_cells(&self, cell_m: f64) -> Option<Body> {
                 match self {
-                    $(Body::$Kind(kind) => kind.with_cells(inclusions, cell_m).map(Body::$Kind),)+
+                    $(Body::$Kind(kind) => kind.with_cells(cell_m).map(Body::$Kind),)+
                 }
             }
         }
@@ -415,12 +415,20 @@ impl Scene {
     /// Returns the scene of the same tissue with cells of `cell_m` (m), unchecked. `None` for a tissue without cells, and if
     /// such cells do not fit.
     pub(crate) fn with_cells(&self, cell_m: f64) -> Option<Scene> {
-        let body = self.body.with_cells(&self.inclusions, cell_m)?;
         // k is E times the edge of a cell, and C that of a full cell.
         let ratio = cell_m / self.shape().edge_m();
-        let stiffness_n_per_m = self.springs.stiffness_n_per_m * ratio;
-        let damping_n_s_per_m = self.damping_n_s_per_m * ratio.powi(3);
-        Some(Scene { body, springs: Springs::alike(stiffness_n_per_m), damping_n_s_per_m, ..self.clone() })
+        let bare = Substance {
+            body: self.body.with_cells(cell_m)?,
+            material: None,
+            inclusions: Arc::default(),
+            springs: Springs::alike(self.springs.stiffness_n_per_m * ratio),
+            anchor_stiffness_n_per_m: self.anchor_stiffness_n_per_m,
+            damping_n_s_per_m: self.damping_n_s_per_m * ratio.powi(3),
+            volume_stiffness_pa: self.volume_stiffness_pa,
+        };
+        let Substance { body, springs, damping_n_s_per_m, .. } =
+            bare.with(self.inclusions.to_vec(), "inclusion").ok()?;
+        Some(Scene { body, springs, damping_n_s_per_m, ..self.clone() })
     }
 
     /// Reads a scene file and applies the `--set` assignments (`key.path=value`), in their order, which

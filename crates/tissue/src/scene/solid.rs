@@ -239,10 +239,10 @@ impl KindOfBody for Solid {
         Err(fields.refuse(Reason::WrongKind, "", SolidMaterial::FOLLOWS))
     }
 
-    fn with_cells(&self, inclusions: &[Inclusion], cell_m: f64) -> Option<Self> {
+    fn with_cells(&self, cell_m: f64) -> Option<Self> {
         let (source, size) = (self.shape.source().clone(), CellSize::Edge(cell_m));
         let shape = SolidShape::of(source, size, self.shape.fixed(), &Limits::default()).ok()?;
-        Solid::new(Arc::new(shape), self.material).with_inclusions(inclusions, "inclusion").ok()
+        Some(Solid::new(Arc::new(shape), self.material))
     }
 
     /// A block of full cubes of the stiffest material, held below.
