@@ -313,11 +313,11 @@ mod tests {
         let (is_kept, refused) = finish(&format!("{TETRAHEDRON}v 5 5 5\nv 6 6 6\n"), false, false);
         assert!(!is_kept && refused.unwrap_err().message.contains("vertices"));
         assert_eq!(finish(TETRAHEDRON, false, true).1.unwrap_err().reason, given_up().reason);
-        // An edge with three triangles.
+        // An edge with three triangles: no surface, but kept for a solid.
         let leaf = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 0 -1 -1\nf 1 2 3\nf 2 1 4\nf 1 2 5\n";
         let (is_kept, report) = finish(leaf, false, false);
         let report = report.unwrap();
-        assert!(!is_kept && report.refused && report.problems[0].place_m.is_some(), "{report:?}");
+        assert!(is_kept && report.refused && report.solid_only && report.problems[0].place_m.is_some(), "{report:?}");
         let (is_kept, report) = finish(leaf, true, false);
         assert!(is_kept && !report.unwrap().refused);
         assert!(unit("ell").is_err() && unit("").is_err());

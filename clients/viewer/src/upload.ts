@@ -226,7 +226,7 @@ export class FileOpener {
     const verdict = !refused ? usable : solidOnly ? filled : isMended ? beyond : mendable;
     const answers = [
       ...(refused ? [] : [["surface", "Touch its surface"] as const]),
-      ...((refused && !solidOnly) || holes > 0 ? [] : [["solid", "Touch it as a solid"] as const]),
+      ...((refused ? solidOnly : holes === 0) ? [["solid", "Touch it as a solid"] as const] : []),
       ...(isMended || problems.length === 0 ? [] : [["mend", "Mend it"] as const]),
     ];
     const [only, ...others] = answers;

@@ -176,16 +176,20 @@ describe("a body of any shape", () => {
     await close(page);
   });
 
-  test("comes as a solid from a file whose triangles form no surface: some are doubled, turned or share an edge with others", async () => {
+  test("comes as a solid from a file whose triangles form no surface: some are doubled or turned, and one is on an edge of two others", async () => {
     const page = await open(`${organs.url}/?scene=patch`);
     const lines = readFileSync(join(folder, "kidney.obj"), "utf8").split("\n");
     const vertices = lines.filter((line) => line.startsWith("v "));
     const faces = lines.filter((line) => line.startsWith("f ")).map((line) => line.replace(/\/\d*/g, ""));
+    const corners = (/** @type {number} */ k) => faces[k]?.split(" ").slice(1) ?? [];
     const flawed = faces.flatMap((face, k) => {
-      const [, a = "", b = "", c = ""] = face.split(" ");
-      if (k % 50 === 0) return [`f ${a} ${c} ${b}`];
-      return k % 50 === 25 ? [face, face, `f ${a} ${b} ${1 + (k % vertices.length)}`] : [face];
+      const [a = "", b = "", c = ""] = corners(k);
+      return k % 50 === 0 ? [`f ${a} ${c} ${b}`] : k % 50 === 25 ? [face, face] : [face];
     });
+    // A third triangle on an edge.
+    const [a = "", b = "", c = ""] = corners(25);
+    const beside = [...corners(26), ...corners(27), ...corners(28)].find((vertex) => ![a, b, c].includes(vertex));
+    flawed.push(`f ${a} ${b} ${beside}`);
     await dropFile(page, "bad.obj", [...vertices, ...flawed].join("\n"));
     await page.page.check("#own-units input[value=m]");
     await page.page.click("#own-buttons button.main");
