@@ -12,7 +12,7 @@ use glam::{DQuat, DVec3};
 use palpate_haptics::Tip;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
-use palpate_tissue::response::mesh_error::MeshError;
+use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::response::tangent;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::profile::Poke;
@@ -165,7 +165,7 @@ fn touch(report: &mut BenchReport) -> Panel {
             let largest = ratios.iter().copied().fold(0.0, f64::max);
             let turned = block(BLOCK_M, cell_m, nu, turn, "");
             let turned_ratio = stiffness(&turned, turn * middle_m) / truth;
-            let estimate = MeshError::of(&model, Disc { radius_m: RADIUS_M, at_m: middle_m });
+            let estimate = MeshErrorEstimate::of(&model, Disc { radius_m: RADIUS_M, at_m: middle_m });
             let estimated = estimate.map_or(f64::NAN, |estimate| estimate.relative / (ratios[0] - 1.0));
             rows.push(cells([
                 nu.to_string(),

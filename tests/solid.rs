@@ -13,7 +13,7 @@ use palpate_refusal::Reason;
 use palpate_session::indentation::Indentation;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
-use palpate_tissue::response::mesh_error::MeshError;
+use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::{CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
@@ -166,13 +166,13 @@ fn the_error_of_the_cubes_is_estimated_within_a_factor_of_two() {
     for cell_m in ["0.006", "0.005", "0.00375"] {
         let model = block(&format!("cell_m = {cell_m}"), &[]);
         let disc = Disc { radius_m: 0.005, at_m: DVec3::new(0.03, 0.03, 0.03) };
-        let estimate = MeshError::of(&model, disc).unwrap();
+        let estimate = MeshErrorEstimate::of(&model, disc).unwrap();
         let truth = estimate.stiffness_n_per_m / 107.37 - 1.0;
         println!("{cell_m}: {estimate:?}, {truth}");
         assert!((0.5..2.0).contains(&(estimate.relative / truth)), "{cell_m}: {estimate:?}, {truth}");
     }
     assert_eq!(
-        MeshError::of(
+        MeshErrorEstimate::of(
             &common::model(&common::scene_with(common::SMALL, &[])),
             Disc { radius_m: 0.1, at_m: DVec3::ZERO }
         ),

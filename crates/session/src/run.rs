@@ -8,7 +8,7 @@ use super::simulation::{Simulation, SimulationFailure};
 use palpate_haptics::Tip;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
-use palpate_tissue::response::mesh_error::MeshError;
+use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
 use palpate_tissue::scene::profile::PoseProfile;
@@ -168,7 +168,7 @@ pub fn run_with(
     let warnings = far_warning(largest_displacement_m, model.shape()).into_iter().chain(on_fixed).collect();
     let summary = Summary {
         audited_error,
-        mesh_error_estimate: MeshError::of(model, disc(model, script)).map(|error| error.relative),
+        mesh_error_estimate: MeshErrorEstimate::of(model, disc(model, script)).map(|error| error.relative),
         corrections,
         recoveries: session.recoveries().list(),
         warnings,

@@ -9,7 +9,7 @@ use palpate_haptics::{Coupling, Law, Tip};
 
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
-use palpate_tissue::response::mesh_error::MeshError;
+use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::BodyKind;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
@@ -40,7 +40,7 @@ pub(super) struct Prospect {
     /// Why there is no law.
     no_law: &'static str,
     /// The error of the cells of a solid under that fingertip.
-    cells: Option<MeshError>,
+    cells: Option<MeshErrorEstimate>,
     /// Depth of the deepest sensible press by a fingertip, m: half the shorter side, or as far as the law reaches.
     deepest_m: f64,
     is_by_law: bool,
@@ -135,7 +135,7 @@ impl Prospect {
             radius_m,
             law,
             no_law: "its force law takes too much work",
-            cells: MeshError::of(model, Disc::in_middle(model, radius_m)),
+            cells: MeshErrorEstimate::of(model, Disc::in_middle(model, radius_m)),
             deepest_m: half_m.min(reach_m),
             is_by_law: reach_m < half_m,
             rest_s: Relaxation::of(&model.scene).rest_s(AT_REST),

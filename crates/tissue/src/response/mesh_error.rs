@@ -18,7 +18,7 @@ const MAX_POINTS: usize = 50_000;
 
 /// An estimate of the error that the size of the cells makes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MeshError {
+pub struct MeshErrorEstimate {
     /// Stiffness under the disc, divided by that of infinitely small cells, minus 1: positive if the cells are too stiff.
     pub relative: f64,
     /// Stiffness under the disc against a slow and small press along the normal, N/m.
@@ -27,7 +27,7 @@ pub struct MeshError {
     pub compared_cell_m: f64,
 }
 
-impl MeshError {
+impl MeshErrorEstimate {
     /// Estimates the error of the cells of a model under a disc, at a slow and small press. `None` for a tissue without
     /// cells, if nothing under the disc can move, and if the cells for comparison would not fit. Takes up to some seconds.
     /// Unwinds with a refusal if there is no memory ([`attempt`](crate::memory::attempt)).
@@ -46,7 +46,7 @@ impl MeshError {
             stiffness_n_per_m - (other - stiffness_n_per_m) / (growth - 1.0)
         };
         let is_sound = true_n_per_m > 0.0 && true_n_per_m.is_finite();
-        is_sound.then(|| MeshError {
+        is_sound.then(|| MeshErrorEstimate {
             relative: stiffness_n_per_m / true_n_per_m - 1.0,
             stiffness_n_per_m,
             compared_cell_m,
