@@ -187,7 +187,7 @@ impl UploadReading {
             problems,
             groups: mesh.groups.iter().map(|group| group.name.clone()).take(GROUPS_TOLD).collect(),
             refused,
-            solid_only: refused && found.may_enclose(),
+            solid_only: refused && found.refusal_of_solid().is_none(),
         };
         if !refused || report.solid_only {
             let bytes = bytes_of(&mesh);

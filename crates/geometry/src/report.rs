@@ -188,12 +188,11 @@ impl MeshReport {
         self.problems.iter().find(|finding| finding.problem.is_refused())
     }
 
-    /// Returns whether the triangles may enclose a space: nothing else is refused than how they are joined
-    /// ([`Problem::is_of_joints`]).
+    /// Returns the first problem for which not even a solid can fill the triangles: one that is refused, and not only because
+    /// of how they are joined ([`Problem::is_of_joints`]). `None` if they may enclose a space.
     #[must_use]
-    pub fn may_enclose(&self) -> bool {
-        let mut refused = self.problems.iter().filter(|finding| finding.problem.is_refused());
-        refused.all(|finding| finding.problem.is_of_joints())
+    pub fn refusal_of_solid(&self) -> Option<&Finding> {
+        self.problems.iter().find(|finding| finding.problem.is_refused() && !finding.problem.is_of_joints())
     }
 }
 

@@ -1,6 +1,8 @@
 //! A bounding volume hierarchy of triangles: finds the triangles that overlap a box, and the nearest point to a given
 //! point.
 
+use std::ops::Range;
+
 use glam::DVec3;
 
 use crate::work::spend;
@@ -79,6 +81,26 @@ impl Tree {
             }
         }
         tree
+    }
+
+    /// Returns the number of nodes. Node 0 is the root, if there is any.
+    pub(crate) fn len(&self) -> usize {
+        self.nodes.len()
+    }
+
+    /// Returns the triangles in the order in which each node has a range of them.
+    pub(crate) fn order(&self) -> &[u32] {
+        &self.order
+    }
+
+    /// Returns the range of a node in the order of triangles.
+    pub(crate) fn range(&self, node: usize) -> Range<usize> {
+        self.nodes[node].start..self.nodes[node].end
+    }
+
+    /// Returns both halves of a node; `None` for a leaf.
+    pub(crate) fn halves(&self, node: usize) -> Option<[usize; 2]> {
+        self.nodes[node].second.map(|second| [node + 1, second])
     }
 
     /// Calls `found` for the triangles whose boxes overlap a box, until it returns false. Returns the number of

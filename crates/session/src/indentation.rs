@@ -92,8 +92,7 @@ impl Indentation {
     /// Returns the place of the rest surface where the tip goes in, m, and the direction out of the tissue there.
     fn on_surface(&self, model: &Model) -> (DVec3, DVec3) {
         let wanted_m = self.place_m.unwrap_or_else(|| model.shape().pressed_m());
-        let footprint = Footprint::new(model, self.radius_m, wanted_m);
-        footprint.at_rest()
+        Footprint::new(model, self.radius_m, wanted_m).at_rest()
     }
 
     /// Returns the times at which the tip has arrived at its depth, leaves it, and is back, s.
@@ -142,7 +141,7 @@ impl Indentation {
         let deepest = (0..samples.len()).max_by(|a, b| samples[*a].0.total_cmp(&samples[*b].0)).unwrap_or(0);
         let last_deepest =
             samples.iter().rposition(|sample| sample.0 >= samples[deepest].0 * (1.0 - 1e-6)).unwrap_or(0);
-        let (loading, unloading) = (&samples[..=deepest.min(samples.len() - 1)], &samples[last_deepest..]);
+        let (loading, unloading) = (samples.get(..=deepest).unwrap_or_default(), &samples[last_deepest..]);
         let largest_m = samples.get(deepest).map_or(0.0, |sample| sample.0.max(0.0));
         let curve: Vec<DepthForce> = (0..=DEPTHS)
             .map(|k| {

@@ -6,6 +6,7 @@
 use glam::DVec3;
 use palpate_geometry::decimate::{MeshPlace, decimate};
 use palpate_geometry::delaunay::flip_to_delaunay;
+use palpate_geometry::report::Finding;
 use palpate_geometry::surface::nearest_place;
 use palpate_geometry::work::spend;
 use palpate_geometry::{FileMesh, MeshReport, TriangleMesh, prepare};
@@ -55,8 +56,7 @@ impl Simulated {
         let prepared = prepare(mesh);
         let report = prepared.report();
         if let Some(finding) = report.refusal() {
-            let message = format!("{finding}; `palpate mesh FILE --repair` may mend it");
-            return Err(Refusal::new(Reason::Unreadable, "mesh", message));
+            return Err(Refusal::new(Reason::Unreadable, "mesh", to_repair(finding)));
         }
         let findings = findings_of(&prepared.notes, &report);
         Ok(Self { findings, ..Self::bound(prepared.mesh, prepared.file, vertices, flips) })
@@ -99,6 +99,11 @@ fn coarser(mesh: TriangleMesh, file: Option<FileMesh>, vertices: usize, flips: b
     let file = file.unwrap_or_else(|| FileMesh { vertex_of: (0..).take(vertices_m.len()).collect(), mesh });
     let shown = Shown::decimated(file, &vertices_m, &coarse, &before, &decimated.places);
     (coarse, shown)
+}
+
+/// Returns the message of a refusal of a mesh: what is wrong, and what may mend it.
+pub(super) fn to_repair(finding: &Finding) -> String {
+    format!("{finding}; `palpate mesh FILE --repair` may mend it")
 }
 
 /// Returns what was done with a mesh and the first problem of each kind, as sentences for the user.

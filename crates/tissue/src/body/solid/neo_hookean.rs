@@ -188,10 +188,10 @@ impl<T: Real> NeoHookean<T> {
             }
         }
         if let Some(factor) = far {
-            let turned = across(h);
+            let slope = half_slope_of_squares(h);
             for c in 0..3 {
                 for along in 0..3 {
-                    let more = factor.mul_add(turned[c][along], p[c][along]);
+                    let more = factor.mul_add(slope[c][along], p[c][along]);
                     p[c][along] = V::select(is_far, more, p[c][along]);
                 }
             }
@@ -272,7 +272,7 @@ fn squares<V: Vector>(cofactor: &[[V; 3]; 3], trace: V) -> V {
 
 /// Returns |A|²A − A·Aᵀ·A of A = 4F = 4 + h: half the derivative of |cof A|².
 #[inline(always)]
-fn across<V: Vector>(h: &[[V; 3]; 3]) -> [[V; 3]; 3] {
+fn half_slope_of_squares<V: Vector>(h: &[[V; 3]; 3]) -> [[V; 3]; 3] {
     let (zero, four) = (h[0][0].splat(V::Real::default()), h[0][0].splat(V::Real::of(4.0)));
     let mut a = *h;
     for c in 0..3 {
@@ -287,15 +287,15 @@ fn across<V: Vector>(h: &[[V; 3]; 3]) -> [[V; 3]; 3] {
         }
     }
     let whole = products[0][0].add(products[1][1]).add(products[2][2]);
-    let mut turned = [[zero; 3]; 3];
+    let mut slope = [[zero; 3]; 3];
     for c in 0..3 {
         for along in 0..3 {
             let mut value = whole.mul(a[c][along]);
             for k in 0..3 {
                 value = value.minus(a[c][k], products[k][along]);
             }
-            turned[c][along] = value;
+            slope[c][along] = value;
         }
     }
-    turned
+    slope
 }

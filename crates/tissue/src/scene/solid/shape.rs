@@ -11,7 +11,7 @@ use palpate_geometry::{Group, TriangleMesh, prepare, report};
 use super::fixed::{FixedPart, along_axis};
 use crate::limits::Limits;
 use crate::scene::mesh::{MeshShape, group_named};
-use crate::scene::shown::findings_of;
+use crate::scene::shown::{findings_of, to_repair};
 use crate::shape::{CellPlace, Deepest, Extent, PointId, PointName, RestShape, ShownShape};
 use palpate_refusal::{Reason, Refusal, Result, legible};
 
@@ -376,12 +376,10 @@ impl Enclosing {
     fn of(mesh: TriangleMesh) -> Result<Self> {
         let prepared = prepare(mesh);
         let report = prepared.report();
-        let mut refused = report.problems.iter().filter(|finding| finding.problem.is_refused());
-        if let Some(finding) = refused.clone().find(|finding| !finding.problem.is_of_joints()) {
-            let message = format!("{finding}; `palpate mesh FILE --repair` may mend it");
-            return Err(Refusal::new(Reason::Unreadable, "", message));
+        if let Some(finding) = report.refusal_of_solid() {
+            return Err(Refusal::new(Reason::Unreadable, "", to_repair(finding)));
         }
-        let is_surface = refused.next().is_none();
+        let is_surface = report.refusal().is_none();
         Ok(Enclosing { findings: findings_of(&prepared.notes, &report), mesh: prepared.mesh, is_surface })
     }
 }
