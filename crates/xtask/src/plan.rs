@@ -329,13 +329,13 @@ mod tests {
             unix,
             [
                 WORKSPACE,
-                "(in proto/generator) cargo fmt --check",
-                "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator",
                 "(in clients/viewer) npm test",
                 "(in clients/typescript) npm test",
                 "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
                  --force-reinstall ./clients/python",
                 "target/venv/bin/python -m unittest discover -s clients/python/tests -v",
+                "(in proto/generator) cargo fmt --check",
+                "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator",
                 "PROPTEST_RNG_SEED=20261122 RUST_TEST_THREADS=6 cargo test --release --workspace --no-fail-fast",
                 "sh tests/abi/check.sh target/release interface",
                 "target/venv/bin/python -m unittest discover -s tests/python -v",
