@@ -5,6 +5,7 @@ mod common;
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use glam::DVec3;
 use palpate_geometry::ReadLimits;
@@ -12,10 +13,10 @@ use palpate_haptics::Tip;
 use palpate_refusal::Reason;
 use palpate_session::indentation::Indentation;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::{CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
+use palpate_tissue::scene::{Body, CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
 
 /// A block of 60 × 60 × 30 mm that is held below, of a tissue of 8 kPa.
@@ -111,6 +112,134 @@ fn every_scheme_steps_a_solid_and_its_bits_are_those_of_every_width() {
         };
         assert_eq!(hash("plain"), hash("auto"), "{scheme}");
     }
+}
+
+type StillPress = fn(&mut dyn Tissue);
+
+/// A press that stays still: by a force, and by a finger that stays where it is.
+fn presses() -> [(&'static str, StillPress); 2] {
+    let by_force = |tissue: &mut dyn Tissue| push(tissue, DVec3::new(1e-4, 5e-5, -5e-4));
+    let by_finger = |tissue: &mut dyn Tissue| tissue.pose(0, DVec3::new(0.03, 0.03, 0.029), Tip::default());
+    [("force", by_force), ("finger", by_finger)]
+}
+
+#[test]
+fn a_still_press_sleeps_within_the_tolerance_and_so_does_the_solid_when_it_is_released() {
+    for (name, press) in presses() {
+        for tolerance in [1e-2, 1e-3] {
+            let with = |tolerance: f64| {
+                let set = format!("sleep.tolerance={tolerance}");
+                at_rest(&block("cell_m = 0.003", &[&set, "stepping.precision=\"f64\""]))
+            };
+            let (mut truth, mut sleeping) = (with(0.0), with(tolerance));
+            assert_eq!(sleeping.awake_points(), 0);
+            let (mut error_m, mut largest_m) = (0.0_f64, 0.0_f64);
+            for step in 0..1200 {
+                for tissue in [&mut truth, &mut sleeping] {
+                    if step == 0 {
+                        press(&mut **tissue);
+                    }
+                    if step == 600 {
+                        tissue.release(0);
+                    }
+                    tissue.step().unwrap();
+                }
+                if step % 50 == 49 {
+                    for point in truth.model().points() {
+                        let [exact_m, found_m] = [&truth, &sleeping].map(|tissue| tissue.point(point).displacement_m);
+                        error_m = error_m.max(exact_m.distance(found_m));
+                        largest_m = largest_m.max(exact_m.length());
+                    }
+                }
+                if step == 599 {
+                    let part = sleeping.awake_points() as f64 / truth.awake_points() as f64;
+                    println!("{name}, {tolerance:e}: {part} awake under it, error {:e}", error_m / largest_m);
+                    assert!(part < if name == "force" { 1e-9 } else { 0.5 }, "{name} {tolerance:e}: {part}");
+                }
+            }
+            assert!(
+                error_m <= tolerance * largest_m && largest_m > 1e-4,
+                "{name} {tolerance:e}: {error_m} {largest_m}"
+            );
+            assert_eq!(sleeping.awake_points(), 0, "{name} {tolerance:e}");
+        }
+    }
+}
+
+#[test]
+fn what_sleeps_and_wakes_has_the_same_bits_at_every_width() {
+    for (name, press) in presses() {
+        let hashes = |lanes: &str| {
+            let set = format!("stepping.lanes=\"{lanes}\"");
+            let mut tissue = at_rest(&block("cell_m = 0.003", &[&set, "sleep.tolerance=1e-2"]));
+            press(&mut *tissue);
+            (0..400).for_each(|_| tissue.step().unwrap());
+            assert!(tissue.computed_fraction() < 1.0, "{name}");
+            let pressed = tissue.state_hash();
+            tissue.pose(1, DVec3::new(0.015, 0.02, 0.0295), Tip::default());
+            (0..50).for_each(|_| tissue.step().unwrap());
+            [pressed, tissue.state_hash()]
+        };
+        assert_eq!(hashes("plain"), hashes("auto"), "{name}");
+    }
+}
+
+fn first_n_per_m(model: &Model) -> f64 {
+    let disc = Disc::in_middle(model, Tip::default().radius_m);
+    force_law::first(model, disc, &AtomicBool::new(false)).unwrap().rows[0].stiffness_n_per_m
+}
+
+#[test]
+fn a_layer_is_felt_in_cells_that_are_thicker_than_it() {
+    let stiffness = |cell_m: f64, more: &str| first_n_per_m(&block(&format!("cell_m = {cell_m}\n{more}"), &[]));
+    let bare = stiffness(0.003, "");
+    for (factor, least, most) in [(0.2, 0.4, 0.9), (10.0, 1.2, 3.0)] {
+        let layer = format!("[[layer]]\nthickness_m = 0.002\nstiffness_factor = {factor}");
+        let [fine, coarse] = [0.002, 0.004].map(|cell_m| stiffness(cell_m, &layer));
+        println!("{factor}: {bare} without, {fine}, {coarse}");
+        assert!((least..most).contains(&(fine / bare)), "{factor}: {fine} {bare}");
+        // The cells at the surface are half filled, which alone makes them stiffer.
+        assert!((0.9..1.25).contains(&(coarse / fine)), "{factor}: {coarse} {fine}");
+    }
+}
+
+#[test]
+fn layers_follow_one_another_inward_and_are_refused_with_their_field() {
+    let layer = |thickness_m: f64, factor: f64| {
+        format!("[[layer]]\nthickness_m = {thickness_m:?}\nstiffness_factor = {factor:?}\n")
+    };
+    let solid = |layers: &str| match &small(layers, &[]).scene.body {
+        Body::Solid(solid) => solid.clone(),
+        other => panic!("{other:?}"),
+    };
+    // The upper third, the middle one, and the rest of a lattice of 6 × 6 × 3 cubes; the sides have the first layer.
+    let both = solid(&(layer(0.01, 4.0) + &layer(0.01, 2.0)));
+    assert_eq!(both.layers().len(), 2);
+    let of = |i: usize, j: usize, k: usize| both.weights()[(k * 6 + j) * 6 + i];
+    for (at, expected) in [([2, 2, 2], 4.0), ([2, 2, 1], 2.0), ([0, 2, 1], 4.0), ([1, 2, 1], 2.0), ([2, 2, 0], 4.0)] {
+        assert!((of(at[0], at[1], at[2]) - expected).abs() < 1e-6, "{at:?}: {}", of(at[0], at[1], at[2]));
+    }
+    for (layers, field) in [
+        (layer(0.0, 1.0), "layer[0].thickness_m"),
+        (layer(0.001, 1.0) + &layer(0.001, 200.0), "layer[1].stiffness_factor"),
+        (layer(0.001, 1.0).repeat(9), "layer"),
+    ] {
+        let refusal = read(&block_text(&format!("cell_m = 0.01\n{layers}")), &[]).unwrap_err();
+        assert_eq!(refusal.field, field, "{refusal}");
+    }
+    let sheet = palpate_tissue::scene::PAPER.to_owned() + &layer(0.001, 1.0);
+    let refusal = read(&sheet, &[]).unwrap_err();
+    assert_eq!((refusal.field.as_str(), refusal.reason), ("layer", Reason::WrongKind), "{refusal}");
+}
+
+/// All of it would take longer than a first law may: larger cells stand for what is far from the disc.
+#[test]
+fn the_first_law_of_a_solid_of_many_cells_is_near_that_of_all_of_them() {
+    let model = block("cell_m = 0.0015", &[]);
+    let all = MeshErrorEstimate::of(&model, Disc::in_middle(&model, Tip::default().radius_m)).unwrap();
+    let first = first_n_per_m(&model);
+    println!("{first} {}", all.stiffness_n_per_m);
+    assert!((first / all.stiffness_n_per_m - 1.0).abs() < 0.03, "{first} {all:?}");
 }
 
 #[test]

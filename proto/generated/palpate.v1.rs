@@ -2488,6 +2488,10 @@ pub struct Solid {
     /// Damping: the force −c·m·v on a mass m, 1/s; 0 or more. 20 if absent.
     #[prost(double, optional, tag = "8")]
     pub damping_per_s: ::core::option::Option<f64>,
+    /// Layers beneath the surface that are stiffer or softer, as skin: the first begins at the surface, each other one beneath
+    /// the one before. At most 8.
+    #[prost(message, repeated, tag = "9")]
+    pub layers: ::prost::alloc::vec::Vec<Layer>,
 }
 impl ::prost::Name for Solid {
     const NAME: &'static str = "Solid";
@@ -2497,6 +2501,26 @@ impl ::prost::Name for Solid {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Solid".into()
+    }
+}
+/// A layer of a solid.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Layer {
+    /// Thickness, m; above 0. Required.
+    #[prost(double, optional, tag = "1")]
+    pub thickness_m: ::core::option::Option<f64>,
+    /// E of the layer divided by E of the solid, 0.01 to 100. Required.
+    #[prost(double, optional, tag = "2")]
+    pub stiffness_factor: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Layer {
+    const NAME: &'static str = "Layer";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Layer".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Layer".into()
     }
 }
 /// A part of space whose points of a solid never move.
@@ -2708,7 +2732,7 @@ pub struct Stepping {
     /// The fixed rate at which commands are applied and samples taken, Hz; 1000 if absent.
     #[prost(double, optional, tag = "1")]
     pub rate_hz: ::core::option::Option<f64>,
-    /// Allowed error of displacement and force, relative to their largest; 1e-5 if absent.
+    /// Allowed error of displacement and force, relative to their largest; if absent 1e-5, of a solid 1e-2.
     #[prost(double, optional, tag = "2")]
     pub tolerance: ::core::option::Option<f64>,
     /// "auto" (the cheapest that keeps the tolerance), "central", "lagged", "rk4", "exponential2", "exponential3" or
@@ -3178,6 +3202,10 @@ pub struct Session {
     /// server measures it (`palpate serve --profile`).
     #[prost(message, repeated, tag = "34")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
+    /// For a solid: the error that the size of its cells makes. Absent until it is estimated, seconds after something has first
+    /// moved, and on a server without audits.
+    #[prost(message, optional, tag = "35")]
+    pub mesh_error_estimate: ::core::option::Option<MeshErrorEstimate>,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";
@@ -3187,6 +3215,33 @@ impl ::prost::Name for Session {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Session".into()
+    }
+}
+/// The error of a solid's cells under a finger that presses the middle of the tissue, slowly and little, estimated by the
+/// same press on cells of another size. Errors of stepping are apart from it.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct MeshErrorEstimate {
+    /// Stiffness under the finger, divided by that of infinitely small cells, minus 1: positive if the cells are too stiff.
+    #[prost(double, tag = "1")]
+    pub relative: f64,
+    /// Stiffness under the finger, N/m.
+    #[prost(double, tag = "2")]
+    pub stiffness_n_per_m: f64,
+    /// Radius of the finger's disc, m.
+    #[prost(double, tag = "3")]
+    pub radius_m: f64,
+    /// Edge of the cells of the other press, m.
+    #[prost(double, tag = "4")]
+    pub compared_cell_m: f64,
+}
+impl ::prost::Name for MeshErrorEstimate {
+    const NAME: &'static str = "MeshErrorEstimate";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.MeshErrorEstimate".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.MeshErrorEstimate".into()
     }
 }
 /// The time that a stage of a session's steps has taken.

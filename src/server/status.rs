@@ -60,6 +60,7 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
         extent: Some(pb::Extent { top_m: vector(model.shape().top_m()), ..wire::extent(&model.shape().extent()) }),
         stages: status.stages.into_iter().map(stage_time).collect(),
         audit: audit(handle),
+        mesh_error_estimate: mesh_error(handle),
         journal: handle.event_log.as_deref().map(journal),
         playback: handle.playback.as_ref().map(playback),
         ..Default::default()
@@ -117,6 +118,17 @@ fn audit(handle: &SessionHandle) -> Option<pb::Audit> {
             precision: correction.precision.name().to_owned(),
             sleep_tolerance: correction.sleep_tolerance,
         }),
+    })
+}
+
+/// Returns the error of the cells of a session's tissue; `None` before it is estimated.
+fn mesh_error(handle: &SessionHandle) -> Option<pb::MeshErrorEstimate> {
+    let estimate = handle.audited().mesh_error?;
+    Some(pb::MeshErrorEstimate {
+        relative: estimate.relative,
+        stiffness_n_per_m: estimate.stiffness_n_per_m,
+        radius_m: estimate.radius_m,
+        compared_cell_m: estimate.compared_cell_m,
     })
 }
 

@@ -183,6 +183,13 @@ impl EtcdMembers {
     /// Freezes a member (SIGSTOP).
     pub fn pause(&self, index: usize) {
         self.signal(index, Signal::STOP);
+        // The kernel stops it when it next runs, until which it may answer.
+        let id = self.members[index].child.as_ref().unwrap().id();
+        let begun = std::time::Instant::now();
+        while !std::fs::read_to_string(format!("/proc/{id}/stat")).unwrap().contains(") T ") {
+            assert!(begun.elapsed() < ETCD_TIMEOUT, "member {index} does not stop");
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
     }
 
     /// Lets a frozen member continue.

@@ -559,6 +559,7 @@ setInterval(() => {
     isAsleep: newest?.asleep ?? session.resting,
     auditedError: audited && Math.max(audited.displacement, audited.force),
     tolerance: session.scene?.stepping?.tolerance,
+    cellsError: session.meshErrorEstimate?.relative,
   });
 }, 1000);
 

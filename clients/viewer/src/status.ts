@@ -28,6 +28,8 @@ export interface Figures {
   /** The larger of the relative errors of displacement and force in the newest audit; missing before the first. */
   auditedError?: number;
   tolerance?: number;
+  /** How much stiffer than infinitely small ones the cells of a solid are under a finger; missing if unknown. */
+  cellsError?: number;
 }
 
 /** Limits beyond which the light is slow or lost. */
@@ -160,6 +162,10 @@ export class Status {
     if (figures.auditedError !== undefined) {
       const asked = figures.tolerance === undefined ? "" : ` (tolerance ${figures.tolerance.toExponential(0)})`;
       this.set("error", `${figures.auditedError.toExponential(0)}${asked}`);
+    }
+    if (figures.cellsError !== undefined) {
+      const percent = 100 * figures.cellsError;
+      this.set("error of the cells", `${percent >= 0 ? "+" : "−"}${Math.abs(percent).toFixed(0)} % of the stiffness`);
     }
   }
 

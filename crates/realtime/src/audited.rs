@@ -3,6 +3,7 @@
 
 use super::thread_counters::Count;
 use palpate_refusal::Refusal;
+use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::record::{AuditedError, Correction};
 use palpate_tissue::select::audit::{ErrorExtent, Origin};
 
@@ -27,6 +28,10 @@ pub struct Audited {
     pub correction: Option<Correction>,
     /// Why the newest correction that was needed could not be made; `None` after one that was made.
     pub refused_correction: Option<Refusal>,
+    /// The error that the size of a solid's cells makes; `None` before it is estimated, and of other tissues.
+    pub mesh_error: Option<MeshErrorEstimate>,
+    /// Whether the error of the cells was estimated, with or without a result.
+    pub(super) knows_mesh: bool,
     pub(super) extent: ErrorExtent,
     pub(super) warned_ns: Option<u64>,
 }

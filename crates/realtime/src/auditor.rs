@@ -23,12 +23,15 @@ use super::clock::{now_ns, thread_time_ns};
 use super::cost::check_work;
 use super::inbox::Request;
 use super::session_handle::SessionHandle;
+use palpate_haptics::Tip;
 use palpate_refusal::Result;
 use palpate_session::budget::{Purpose, Resource};
 use palpate_tissue::Model;
 use palpate_tissue::guard::INTERVAL_SUBSTEPS;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
+use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::Correction;
 use palpate_tissue::select::audit::{Audit, AuditFinding, FINER, Mark, Origin, WindowInputs};
@@ -75,7 +78,10 @@ impl Auditor {
                 Some(handle) => {
                     last.clone_from(&handle.id);
                     // A fault in one audit must not end the others.
-                    let audited = catch_unwind(AssertUnwindSafe(|| audit(&handle, sessions, &mut duty, &self.tally)));
+                    let audited = catch_unwind(AssertUnwindSafe(|| {
+                        estimate_mesh_error(&handle);
+                        audit(&handle, sessions, &mut duty, &self.tally);
+                    }));
                     if let Err(panic) = audited {
                         match memory::refusal_of(&*panic) {
                             Some(refusal) => tracing::debug!(session = %handle.id, %refusal, "no audit"),
@@ -127,6 +133,21 @@ impl Duty<'_> {
         let rest_s = busy_ns as f64 * 1e-9 * (self.share.recip() - 1.0).max(0.0);
         self.auditor.wait(Duration::from_secs_f64(rest_s))
     }
+}
+
+/// Estimates the error of the cells of a session's tissue, once. It takes up to some seconds.
+fn estimate_mesh_error(handle: &SessionHandle) {
+    if std::mem::replace(&mut lock(&handle.audited).knows_mesh, true) {
+        return;
+    }
+    // Eight times as many cells, if they are few.
+    let bytes = 9 * handle.model.bytes();
+    let _taken = match handle.owner.take(Resource::Memory(Purpose::Laws), bytes, "") {
+        Ok(taken) => taken,
+        Err(refusal) => return tracing::debug!(session = %handle.id, %refusal, "no estimate of the cells' error"),
+    };
+    let disc = Disc::in_middle(&handle.model, Tip::default().radius_m);
+    lock(&handle.audited).mesh_error = MeshErrorEstimate::of(&handle.model, disc);
 }
 
 /// Audits one window of a session, if the window arrives in time and there is memory for it.

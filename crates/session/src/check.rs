@@ -34,6 +34,12 @@ pub struct CheckReport {
 /// Predicted time of a step above which it is not timed, s.
 const LONGEST_STEP_S: f64 = 0.2;
 
+/// The part of a core that a solid may take.
+const LOAD: f64 = 0.7;
+
+/// With n times as many cells, a step has n times as many points, and n^⅓ times as many substeps.
+const CELLS_OVER_COST: f64 = 0.75;
+
 /// Number of windows in which the step is timed, and the length of each, s.
 const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
@@ -125,9 +131,10 @@ impl fmt::Display for CheckReport {
         let slowest = Relaxation::of(scene).slowest_per_s();
         writeln!(
             f,
-            "frequencies   {:.3} Hz (a point on its anchor spring alone) to at most {:.3} Hz (ω_b = {:.4} rad/s, under any \
+            "frequencies   {:.3} Hz ({}) to at most {:.3} Hz (ω_b = {:.4} rad/s, under any \
              deformation)",
             slowest / TAU,
+            scene.body.kind().slowest_vibration(),
             model.omega_bound_per_s / TAU,
             model.omega_bound_per_s
         )?;
@@ -195,6 +202,14 @@ impl fmt::Display for CheckReport {
             )?;
             let sessions = 1.0 / (median_s * scene.stepping.rate_hz);
             writeln!(f, "sessions      {sessions:.1} on a core, without clients and frames")?;
+            if let Some(cells) = scene.body.kind().cells() {
+                let most = cells as f64 * (LOAD * sessions).powf(CELLS_OVER_COST);
+                let percent = 100.0 * LOAD;
+                writeln!(
+                    f,
+                    "capacity      about {most:.0} cells on this core, at {percent:.0} % of real time: solid.cells = {most:.0}"
+                )?;
+            }
         } else if model.predicted_step_s() > LONGEST_STEP_S {
             writeln!(f, "time          not measured: a step would take about {:.1} s", model.predicted_step_s())?;
         } else {

@@ -12,9 +12,9 @@ use super::required;
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
 use palpate_tissue::scene::sent::{self, MeshFile};
 use palpate_tissue::scene::{
-    Appearance, Body, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Material,
-    Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid, SolidMaterial, Springs, Stepping,
-    Substance, Volume,
+    Appearance, Body, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Layer,
+    Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid, SolidMaterial, Springs,
+    Stepping, Substance, Volume,
 };
 use palpate_tissue::shape::RestShape;
 
@@ -47,6 +47,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
             return Err(Refusal::new(Reason::WrongKind, "solid", message));
         }
     };
+    let stepping = Stepping::usual(substance.body.kind());
     Ok(Scene {
         name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
         body: substance.body,
@@ -56,7 +57,10 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
         damping_n_s_per_m: substance.damping_n_s_per_m,
         volume_stiffness_pa: substance.volume_stiffness_pa,
-        stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
+        stepping: match &message.stepping {
+            Some(message) => from_stepping(message, &stepping)?,
+            None => stepping,
+        },
         sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
         appearance: Appearance::default(),
     })
@@ -179,9 +183,18 @@ fn from_solid(message: &pb::Scene, of_solid: &pb::Solid, mesh: &TriangleMesh) ->
     if fixed.is_empty() {
         return Err(Refusal::new(Reason::Missing, "solid.fixed", "is missing: nothing would hold the solid"));
     }
-    let solid = Solid::of(mesh.clone(), size, &fixed, material)?;
+    let layers = of_solid.layers.iter().enumerate().map(from_layer).collect::<Result<Vec<_>>>()?;
+    let solid = Solid::of(mesh.clone(), size, &fixed, material)?.with_layers(&layers, "solid.layers")?;
     let inclusions = message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?;
     Substance::of_solid(solid).with(inclusions, "inclusions")
+}
+
+fn from_layer((index, message): (usize, &pb::Layer)) -> Result<Layer> {
+    let field = |key: &str| format!("solid.layers[{index}].{key}");
+    Ok(Layer {
+        thickness_m: required(&field("thickness_m"), message.thickness_m)?,
+        stiffness_factor: required(&field("stiffness_factor"), message.stiffness_factor)?,
+    })
 }
 
 fn from_fixed_part((index, message): (usize, &pb::FixedPart)) -> Result<FixedPart> {
@@ -262,8 +275,7 @@ fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<FixedPoints> {
     })
 }
 
-fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
-    let standard = Stepping::default();
+fn from_stepping(message: &pb::Stepping, standard: &Stepping) -> Result<Stepping> {
     let or_auto = |name: &String| if name.is_empty() { "auto".to_owned() } else { name.clone() };
     Ok(Stepping {
         rate_hz: message.rate_hz.unwrap_or(standard.rate_hz),
@@ -423,6 +435,10 @@ fn solid(solid: &Solid) -> pb::Solid {
         }
         FixedPart::Group(name) => pb::fixed_part::Part::Group(name.clone()),
     };
+    let layer = |Layer { thickness_m, stiffness_factor }: &Layer| pb::Layer {
+        thickness_m: Some(*thickness_m),
+        stiffness_factor: Some(*stiffness_factor),
+    };
     pb::Solid {
         mesh_id: String::new(),
         cell_m: Some(solid.shape.lattice().edge_m),
@@ -432,6 +448,7 @@ fn solid(solid: &Solid) -> pb::Solid {
         poissons_ratio: Some(solid.material.poissons_ratio),
         density_kg_per_m3: Some(solid.material.density_kg_per_m3),
         damping_per_s: Some(solid.material.damping_per_s),
+        layers: solid.layers().iter().map(layer).collect(),
     }
 }
 

@@ -157,6 +157,13 @@ impl Model {
         })
     }
 
+    /// Returns the model of the same tissue with cells of `cell_m` (m) and the same plan: for presses, not for stepping. `None` for a
+    /// tissue without cells, and if such cells do not fit.
+    pub(crate) fn with_cells(&self, cell_m: f64) -> Option<Self> {
+        let scene = self.scene.with_cells(cell_m)?;
+        Model::planned(scene, self.plan.clone(), self.precision, self.lanes).ok()
+    }
+
     /// Returns the sleep tolerance of the tiles. Where nothing pulls a tissue back, nothing bounds how far an
     /// omitted force would move it; then only tiles that do not move at all may sleep.
     pub(crate) fn tile_tolerance(&self) -> f64 {

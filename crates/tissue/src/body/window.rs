@@ -35,17 +35,17 @@ impl Window {
     /// Returns the window around a footprint on `model`: all points within [`half_window_m`] of the disc's middle, on
     /// a sheet in both directions, on a mesh in space. Without anchor springs these are all points.
     pub fn around(model: &Model, footprint: &Footprint) -> Self {
-        Self::at(model, footprint.radius_m(), footprint.anchor_m(), usize::MAX)
+        Self::at(model, footprint.radius_m(), footprint.anchor_m(), usize::MAX, f64::INFINITY)
     }
 
-    /// Returns the window around a place of the rest surface; on a mesh, the radius shrinks until it has at
-    /// most `most` points.
-    pub(crate) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
+    /// Returns the window around a place of the rest surface; on a mesh, the points at most `reach_m` (m) away, and the radius
+    /// shrinks until there are at most `most` points.
+    pub(crate) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize, reach_m: f64) -> Self {
         match &model.places {
             Places::Sheet(_) => Self::of_sheet(model, radius_m, centre_m.truncate()),
             Places::Surface(_) | Places::Solid(_) => {
                 let shape = model.shape();
-                let mut within_m = half_window_m(model, radius_m).min(2.0 * shape.longest_side_m());
+                let mut within_m = half_window_m(model, radius_m).min(2.0 * shape.longest_side_m()).min(reach_m);
                 let mut points = shape.around(centre_m, within_m);
                 while points.len() > most && within_m > radius_m {
                     within_m *= 0.9;
@@ -247,9 +247,12 @@ fn of_mesh(model: &Model, slots: &[usize], free: &[bool]) -> Vec<Spring> {
 
 /// Returns the distance from the middle of a disc of `radius_m` at which points still notice it, in spacings h:
 /// a/h + `REACHES`·l/h + 2, with l = h·√(k/K″) the length over which displacements fall by e ([`Relaxation::reach`]);
-/// infinite without anchor springs.
+/// infinite without anchor springs, and in a solid, where displacements fall as 1/r.
 fn half_window(model: &Model, radius_m: f64) -> f64 {
     let scene = &model.scene;
+    if model.places.solid().is_some() {
+        return f64::INFINITY;
+    }
     let springs = &scene.springs;
     let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
     radius_m / model.unit_m + REACHES * Relaxation::of(scene).reach(stiffest) + 2.0
@@ -258,7 +261,7 @@ fn half_window(model: &Model, radius_m: f64) -> f64 {
 /// Returns the distance from the middle of a disc at which points still notice it, m: a + 6·h·√(k/K″) + 2h, with a =
 /// `radius_m` (m), h the distance between points, m (on a mesh, the mean edge), k the larger stiffness of structural
 /// and shear springs and K″ that of an anchor spring, N/m. The root counts as at least 1. Infinite without anchor
-/// springs (K″ = 0).
+/// springs (K″ = 0), and in a solid.
 pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
     half_window(model, radius_m) * model.unit_m
 }

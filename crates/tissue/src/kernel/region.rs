@@ -91,6 +91,13 @@ impl Region {
         &self.awake.members
     }
 
+    /// Returns the rows from `before` rows above the first awake tile to the end of the last one, of `rows` rows in all.
+    /// [`Region::cover`] has sorted the tiles.
+    pub(crate) fn rows(&self, before: usize, rows: usize) -> Range<usize> {
+        let (Some(first), Some(last)) = (self.tiles().first(), self.tiles().last()) else { return 0..0 };
+        (first / self.columns * TILE).saturating_sub(before)..((last / self.columns + 1) * TILE).min(rows)
+    }
+
     /// Makes the strips cover the awake tiles; springs reach over `reach` rows.
     pub(crate) fn cover(&mut self, layout: &Layout, reach: usize) {
         let Region { strips, awake, columns } = self;

@@ -23,6 +23,8 @@ pub struct MeshErrorEstimate {
     pub relative: f64,
     /// Stiffness under the disc against a slow and small press along the normal, N/m.
     pub stiffness_n_per_m: f64,
+    /// Radius of the disc, m.
+    pub radius_m: f64,
     /// Edge of the cells that were pressed for comparison, m.
     pub compared_cell_m: f64,
 }
@@ -35,8 +37,7 @@ impl MeshErrorEstimate {
         let edge_m = model.shape().edge_m();
         let is_finer = 8 * model.len() <= MAX_POINTS;
         let compared_cell_m = if is_finer { 0.5 * edge_m } else { 2.0 * edge_m };
-        let scene = model.scene.with_cells(compared_cell_m)?;
-        let compared = Model::planned(scene, model.plan.clone(), model.precision, model.lanes).ok()?;
+        let compared = model.with_cells(compared_cell_m)?;
         let [own, other] = [model, &compared].map(|model| stiffness_n_per_m(model, disc));
         let (stiffness_n_per_m, other) = (own?, other?);
         let growth = ORDER.exp2();
@@ -49,6 +50,7 @@ impl MeshErrorEstimate {
         is_sound.then(|| MeshErrorEstimate {
             relative: stiffness_n_per_m / true_n_per_m - 1.0,
             stiffness_n_per_m,
+            radius_m: disc.radius_m,
             compared_cell_m,
         })
     }
@@ -56,7 +58,14 @@ impl MeshErrorEstimate {
 
 /// Returns the stiffness against a slow and small press along the normal, N/m; `None` if nothing can move.
 fn stiffness_n_per_m(model: &Model, disc: Disc) -> Option<f64> {
-    let course = Course { radius_m: disc.radius_m, centre_m: disc.at_m, step_m: 0.0, count: 1, points: usize::MAX };
+    let course = Course {
+        radius_m: disc.radius_m,
+        centre_m: disc.at_m,
+        step_m: 0.0,
+        count: 1,
+        points: usize::MAX,
+        within_m: f64::INFINITY,
+    };
     let mut press = Press::new(model, course, Accuracy::COARSE);
     press.deepen(model, &AtomicBool::new(false));
     let stiffness = press.pressed().first()?.tangent.stiffness_n_per_m.z_axis.z;

@@ -417,7 +417,7 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
 /// normal, while Σ w·u = −d along it, with w the weights of the disc. Unwinds with a refusal if there is no memory
 /// ([`attempt`](crate::memory::attempt)).
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
-    let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX };
+    let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX, within_m: f64::INFINITY };
     let mut press = Press::new(model, course, Accuracy::EXACT);
     let never = AtomicBool::new(false);
     while press.deepen(model, &never) == Deepened::Further {}
@@ -439,6 +439,8 @@ pub struct Course {
     /// Largest number of points of a mesh that are computed, unless the disc itself covers more; those beyond are
     /// held. `usize::MAX` for all that notice the disc. Without effect on a sheet.
     pub points: usize,
+    /// Distance from the disc's middle beyond which points of a mesh are held, m; infinite for none. Without effect on a sheet.
+    pub within_m: f64,
 }
 
 /// A slow press under computation, one depth after another, so that its thread can do other work in between. It holds
@@ -479,7 +481,7 @@ impl Press {
     /// Returns the disc at its place, and the window of points that notice it.
     fn laid(model: &Model, course: &Course) -> (Footprint, Window) {
         let footprint = Footprint::new(model, course.radius_m, course.centre_m);
-        let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points);
+        let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points, course.within_m);
         (footprint, window)
     }
 

@@ -150,8 +150,13 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
 
     /// Returns the stiffness that pulls a displaced point of the reference mass back wherever the others are, N/m, with
     /// the reference K″ `anchor_n_per_m`; 0 if nothing does.
-    fn restoring_n_per_m(&self, anchor_n_per_m: f64) -> f64 {
+    fn restoring_n_per_m(&self, _springs: &Springs, anchor_n_per_m: f64) -> f64 {
         anchor_n_per_m
+    }
+
+    /// Returns which vibration [`BodyKind::restoring_n_per_m`] belongs to, in a few words.
+    fn slowest_vibration(&self) -> &'static str {
+        "a point on its anchor spring alone"
     }
 
     /// Returns the fastest vibration of the springs, and where it is; `None` where all points are alike.
@@ -211,6 +216,16 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
     /// another part of the surface. `None` if there is none.
     fn thickness_m(&self, _point: PointId) -> Option<f64> {
         None
+    }
+
+    /// Returns the number of cells; `None` for a tissue without cells.
+    fn cells(&self) -> Option<usize> {
+        None
+    }
+
+    /// Returns the allowed error of stepping for a scene that does not say it.
+    fn usual_tolerance(&self) -> f64 {
+        1e-5
     }
 
     /// Returns the measured cost of a point relative to a point of a sheet.

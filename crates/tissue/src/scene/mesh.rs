@@ -487,7 +487,7 @@ impl BodyKind for Mesh {
 
     /// Returns 0 if a movable point has no anchor: the springs to its neighbours resist a movement across them only as
     /// it stretches them.
-    fn restoring_n_per_m(&self, anchor_n_per_m: f64) -> f64 {
+    fn restoring_n_per_m(&self, _springs: &Springs, anchor_n_per_m: f64) -> f64 {
         if self.has_free_point { 0.0 } else { anchor_n_per_m }
     }
 

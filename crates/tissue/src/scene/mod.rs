@@ -42,7 +42,7 @@ pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{Shown, Simulated};
-pub use solid::{CellSize, FixedPart, Solid, SolidMaterial, SolidShape};
+pub use solid::{CellSize, FixedPart, Layer, Solid, SolidMaterial, SolidShape};
 use source::Files;
 pub use springs::Springs;
 use toml_document::{Document, Fields, Item};
@@ -291,7 +291,7 @@ pub struct Stepping {
     /// Default: 1000.
     pub rate_hz: f64,
     /// Wanted error of displacement and force, each relative to the largest of its kind; above 0 and at most 1.
-    /// Default: 1e-5.
+    /// Default: 1e-5, of a solid 1e-2 ([`Stepping::usual`]).
     pub tolerance: f64,
     /// The scheme that advances the points in time. Default: `auto`.
     pub integrator: Integrator,
@@ -318,6 +318,13 @@ impl Default for Stepping {
             lanes: Lanes::Auto,
             correct: false,
         }
+    }
+}
+
+impl Stepping {
+    /// Returns the stepping of a tissue of a kind whose scene says nothing about it.
+    pub fn usual(kind: &dyn BodyKind) -> Self {
+        Stepping { tolerance: kind.usual_tolerance(), ..Stepping::default() }
     }
 }
 
@@ -491,6 +498,7 @@ impl Scene {
         let scene = document.read(|fields| {
             let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
             let substance = read_substance(fields, files, limits)?;
+            let stepping = Stepping::usual(substance.body.kind());
             Ok(Scene {
                 name,
                 body: substance.body,
@@ -500,7 +508,10 @@ impl Scene {
                 anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
                 damping_n_s_per_m: substance.damping_n_s_per_m,
                 volume_stiffness_pa: substance.volume_stiffness_pa,
-                stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
+                stepping: match fields.item("stepping") {
+                    Some(item) => read_stepping(&item, stepping)?,
+                    None => stepping,
+                },
                 sleep_tolerance: match fields.item("sleep") {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
                     None => None,
@@ -738,6 +749,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     let mut given = Body::SECTIONS.iter().filter_map(|section| Some((*section, fields.item(section)?)));
     let (first, second) = (given.next(), given.next());
     let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
+    let layers = fields.item("layer");
     let of_material = material.is_some();
     if let (Some((section, _)), Some((_, other))) = (&first, &second) {
         let message = format!("does not go with [{section}]: a tissue is one of them");
@@ -754,9 +766,16 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     {
         return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
     }
+    if section != Solid::SECTION
+        && let Some(item) = &layers
+    {
+        return Err(item.refuse(Reason::WrongKind, Layer::OF_A_SOLID));
+    }
     let body = fields.required(section)?.table(|fields| Body::read(section, fields, files, of_material, limits))?;
     let substance = match (body, material) {
-        (Body::Solid(solid), material) => Substance::of_solid(solid::read_material(fields, &solid, material.as_ref())?),
+        (Body::Solid(solid), material) => {
+            Substance::of_solid(solid::read_material(fields, &solid, material.as_ref(), layers.as_ref())?)
+        }
         (Body::Mesh(mesh), material) => {
             if mesh.shape.point_count() > limits.points {
                 mesh.check(limits)?;
@@ -849,8 +868,7 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
     })
 }
 
-fn read_stepping(item: &Item<'_>) -> Result<Stepping> {
-    let standard = Stepping::default();
+fn read_stepping(item: &Item<'_>, standard: Stepping) -> Result<Stepping> {
     item.table(|fields| {
         Ok(Stepping {
             rate_hz: fields.number("rate_hz")?.unwrap_or(standard.rate_hz),

@@ -3,8 +3,8 @@
 
 use crate::scene::Scene;
 
-/// How a displaced tissue comes back to rest, for a point of the reference mass. The slowest vibration decides. It hardly
-/// bends the tissue, so only each point's own anchor pulls it back
+/// How a displaced tissue comes back to rest, for a point of the reference mass. The slowest vibration decides. In tissue
+/// on anchor springs it hardly bends the tissue, so only each point's own anchor pulls it back; a solid has one of its own
 /// ([`BodyKind::restoring_n_per_m`](crate::scene::BodyKind::restoring_n_per_m)).
 #[derive(Debug, Clone, Copy)]
 pub struct Relaxation {
@@ -21,7 +21,7 @@ impl Relaxation {
             mass_kg: kind.point_mass_kg(),
             // Adding 0.0 turns −0.0 into +0.0, so that dividing by it gives +∞.
             damping_n_s_per_m: scene.damping_n_s_per_m + 0.0,
-            restoring_n_per_m: kind.restoring_n_per_m(scene.anchor_stiffness_n_per_m) + 0.0,
+            restoring_n_per_m: kind.restoring_n_per_m(&scene.springs, scene.anchor_stiffness_n_per_m) + 0.0,
         }
     }
 

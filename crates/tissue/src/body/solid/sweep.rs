@@ -115,12 +115,11 @@ impl<T: Real, S: Stage<T>> Run<T> for SolidSweep<'_, T, S> {
         // SAFETY: the caller's promise, and the tables are those of the layout.
         unsafe {
             let mut sums = self.stage.begin::<V>();
-            for k in 0..layout.rows / rows {
-                for j in 0..rows {
-                    // `black_box` hides `j` from the compiler, which would otherwise keep an address for each array.
-                    self.row::<V>(std::hint::black_box(j), k, waiting, all_awake, &mut sums);
-                    self.stage.end_row();
-                }
+            for row in self.over.rows(rows + 1, layout.rows) {
+                // `black_box` hides the row from the compiler, which would otherwise keep an address for each array.
+                let (j, k) = (std::hint::black_box(row % rows), row / rows);
+                self.row::<V>(j, k, waiting, all_awake, &mut sums);
+                self.stage.end_row();
             }
             self.stage.end(sums);
         }
@@ -128,6 +127,16 @@ impl<T: Real, S: Stage<T>> Run<T> for SolidSweep<'_, T, S> {
 }
 
 impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
+    /// Returns whether a corner that is awake belongs to one of the cubes of a row between two columns.
+    #[inline(always)]
+    fn is_needed(&self, row: usize, columns: [usize; 2]) -> bool {
+        let Layout { rows, columns: most, .. } = self.grid.layout;
+        let per_plane = self.grid.places.rows_per_plane();
+        let of_cubes = [row, row + 1, row + per_plane, row + per_plane + 1];
+        let is_awake = |row: usize, column: usize| row < rows && column < most && self.over.is_awake(row, column);
+        of_cubes.iter().any(|row| columns.iter().any(|column| is_awake(*row, *column)))
+    }
+
     /// Sweeps over row (j, k).
     ///
     /// # Safety
@@ -147,6 +156,13 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
             let span = tables.spans[row].clone();
             let mut column = span.start;
             while column < span.end {
+                let is_awake = all_awake || self.over.is_awake(row, column);
+                // A force that waits for a sleeping corner is never used, so it need not be right.
+                if !all_awake && !self.is_needed(row, [column, column + V::LANES]) {
+                    before = [zero; 3];
+                    column += V::LANES;
+                    continue;
+                }
                 let at = at_row + column;
                 let group = *tables.groups.get_unchecked(at / GROUP);
                 let group =
@@ -175,7 +191,8 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
                             ],
                         );
                     }
-                    if S::ENERGY {
+                    // The energy of a cube belongs to its least corner.
+                    if S::ENERGY && is_awake {
                         self.stage.energy(column, law.energy(w, &patterns));
                     }
                     let stress = law.stress(w, &patterns);
@@ -214,7 +231,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
                     before[c] = passed;
                     here[c] = V::load(x.add(c * plane + at));
                 }
-                if all_awake || self.over.is_awake(row, column) {
+                if is_awake {
                     self.stage.finish::<V, ANY>(row, at, here, n, sums);
                 }
                 column += V::LANES;

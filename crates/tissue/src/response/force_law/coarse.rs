@@ -6,8 +6,11 @@
 //! than the same piece of tissue with the coarser points; these differences are added to the depth in the
 //! first.
 //!
-//! On a mesh, it is the law of the points around the disc, as many as time allows: those beyond are held.
+//! On a mesh, it is the law of the points around the disc, as many as time allows: those beyond are held. A solid carries a
+//! load farther. There it is the law of the whole with larger cells, refined in the same way by the points around the disc
+//! with the two sizes of cells.
 
+use std::f64::consts::PI;
 use std::sync::atomic::AtomicBool;
 
 use palpate_haptics::force_law::{Law, Row};
@@ -28,6 +31,11 @@ const EXACT_WORK: u64 = 1_000_000;
 
 /// Work of the first law of a tissue whose law is linear, of which one depth is solved: 0.2 s.
 const LINEAR_WORK: u64 = 8_000_000;
+
+/// How many times as large cells are tried where all of a solid takes more, and how many of its own points around the disc
+/// are computed.
+const LARGER: [f64; 3] = [2.0, 3.0, 4.0];
+const OWN_POINTS: f64 = 4000.0;
 
 /// Rows of a coarse law: cubics between them follow the exact law to one per cent.
 const ROWS: u32 = 6;
@@ -53,6 +61,7 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
         if let Some(law) = whole.filter(Law::is_sound) {
             return Some(Law { is_coarse: true, ..law });
         }
+        return of_larger_cells(model, disc, stop);
     }
     let mut work = EXACT_WORK;
     let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
@@ -75,6 +84,22 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
             law
         })
     })
+}
+
+/// Computes the law of a solid with larger cells, refined around the disc by its own cells.
+fn of_larger_cells(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
+    let edge_m = model.shape().edge_m();
+    for times in LARGER {
+        let larger = model.with_cells(times * edge_m)?;
+        let (whole, half_ball) = (course(disc, ROWS), (1.5 / PI * OWN_POINTS).cbrt() * edge_m);
+        let around = Course { within_m: half_ball.max(disc.radius_m + 3.0 * times * edge_m), ..whole };
+        let of = |model: &Model, course: Course| follow(model, course, Accuracy::COARSE, &mut { LINEAR_WORK }, stop);
+        if let Some(law) = of(&larger, whole) {
+            let law = refined(&law, &of(model, around)?, &of(&larger, around)?);
+            return law.is_sound().then_some(Law { is_coarse: true, ..law });
+        }
+    }
+    None
 }
 
 /// Computes a law with `points` of a mesh, and subtracts its work from `work`.

@@ -52,7 +52,7 @@ impl Computation {
 
 pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
     let step_m = REACH_IN_RADII * radius_m / f64::from(rows - 1);
-    Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX }
+    Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX, within_m: f64::INFINITY }
 }
 
 /// Computes the exact law of a disc of `radius_m` (m) in the middle of a tissue ([`Disc::in_middle`]), with unlimited

@@ -198,7 +198,9 @@ fn a_window_of_a_mesh_is_a_ball_which_shrinks_to_the_disc_until_it_has_few_enoug
     let model = Model::compile(&scene, &Limits::default()).unwrap();
     let (shape, radius_m) = (model.shape(), 0.006);
     let centre_m = shape.rest_m(shape.nearest(shape.extent().middle_m()));
-    let of = |most: usize| -> Vec<usize> { Window::at(&model, radius_m, centre_m, most).points(&model).collect() };
+    let of = |most: usize| -> Vec<usize> {
+        Window::at(&model, radius_m, centre_m, most, f64::INFINITY).points(&model).collect()
+    };
     // Every point that is within a distance and none else.
     let is_ball = |found: &[usize], within_m: f64| {
         model.points().all(|point| {
@@ -213,8 +215,8 @@ fn a_window_of_a_mesh_is_a_ball_which_shrinks_to_the_disc_until_it_has_few_enoug
     let shrunk = |found: &[usize]| (0..60).map(|times| reach_m * 0.9_f64.powi(times)).find(|m| is_ball(found, *m));
     assert!(shrunk(&few).is_some_and(|within_m| within_m > radius_m), "{few:?}");
     assert!(shrunk(&least).is_some_and(|within_m| within_m > 0.9 * radius_m), "{least:?}");
-    assert!(least.len() > 1 && !Window::at(&model, radius_m, centre_m, 1).is_empty());
-    assert!(Window::at(&model, radius_m, DVec3::splat(10.0), usize::MAX).is_empty());
+    assert!(least.len() > 1 && !Window::at(&model, radius_m, centre_m, 1, f64::INFINITY).is_empty());
+    assert!(Window::at(&model, radius_m, DVec3::splat(10.0), usize::MAX, f64::INFINITY).is_empty());
 }
 
 #[test]

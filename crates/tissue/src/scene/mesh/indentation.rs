@@ -22,7 +22,7 @@ pub(super) fn depth_m(
     volume_stiffness_pa: f64,
     poke: &Poke,
 ) -> Option<f64> {
-    if mesh.restoring_n_per_m(anchor_n_per_m) <= 0.0 {
+    if mesh.restoring_n_per_m(springs, anchor_n_per_m) <= 0.0 {
         return None;
     }
     let shape = &mesh.shape;

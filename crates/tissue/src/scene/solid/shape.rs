@@ -26,6 +26,10 @@ const MAX_OPEN: f64 = 0.002;
 /// are as many.
 const MAX_VERTICES: usize = 400_000;
 
+/// Smallest part of a cube that counts for stiffness and mass, if any of it is inside: a corner whose cubes were all
+/// slivers would have no mass.
+const MIN_PART: f64 = 0.1;
+
 /// How large the cubes of a solid are.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CellSize {
@@ -225,6 +229,12 @@ impl SolidShape {
     /// Returns the part of each cube that is inside the surface, 0 to 1, by [`Lattice::index`].
     pub fn parts(&self) -> &[f32] {
         &self.parts
+    }
+
+    /// Returns the part of each cube that counts for stiffness and mass; 0 for a cube outside.
+    pub(super) fn counted_parts(&self) -> Vec<f64> {
+        let counted = |part: &f32| if *part > 0.0 { f64::from(*part).max(MIN_PART) } else { 0.0 };
+        self.parts.iter().map(counted).collect()
     }
 
     /// Returns the surface, with edges about as short as those of a cube: frames show it, and tools touch it.

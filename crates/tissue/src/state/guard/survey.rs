@@ -264,7 +264,12 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
                         n[c].store(self.to_kept[k].add(at));
                     }
                 }
-                most = [most[0].farther(u), most[1].farther(u.sub(x[c])), most[2].farther(w), most[3].farther(short)];
+                most = [
+                    most[0].farther(u),
+                    most[1].farther(u.sub(x[c])),
+                    most[2].farther(speed_seen),
+                    most[3].farther(short),
+                ];
             }
             if !self.masses.is_null() {
                 let mass = V::load(self.masses.add(at));
