@@ -1,11 +1,14 @@
 //! A session that was saved, and restored from bytes, continues with the same bits as one that never stopped.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
+#[path = "common/cases.rs"]
+mod cases;
 mod common;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, OnceLock};
 
+use cases::on_every_core;
 use fastrand::Rng;
 use glam::DVec3;
 use palpate_haptics::{ContactState, Coupling, Tip};
@@ -435,46 +438,56 @@ fn bytes_of(session: &Session) -> Vec<u8> {
 
 #[test]
 fn a_hundred_random_sessions_go_on_with_the_same_bits() {
+    let seeds: Vec<u64> = (0..100).collect();
+    let tried = on_every_core(&seeds, |seed| goes_on_with_the_same_bits(*seed));
+    let (mut seen, mut snapshots) = (Coverage::default(), 0);
+    for (of_one, count) in tried {
+        of_one.0.into_iter().for_each(|(name, times)| *seen.0.entry(name).or_default() += times);
+        snapshots += count;
+    }
+    println!("{snapshots} snapshots: {:?}", seen.0);
+    assert!(seen.0.values().all(|count| *count > 0), "{:?}", seen.0);
+}
+
+/// Restores the snapshots of a random session, and plays each to its end. Returns what they contained, and their number.
+fn goes_on_with_the_same_bits(seed: u64) -> (Coverage, u32) {
     let (mut seen, widths, mut tried) = (Coverage::default(), widths(), 0_u32);
-    for seed in 0..100 {
-        let case = case(seed);
-        let mut random = Rng::with_seed(!seed);
-        let mut session = case.begin();
-        let stops: BTreeSet<u64> = (0..3).map(|_| random.u64(0..case.steps)).collect();
-        // The outputs, and the bytes at the stops.
-        let (mut course, mut saved) = (Vec::new(), Vec::new());
-        while session.step_count() < case.steps && session.hold_reason().is_none() {
-            if stops.contains(&session.step_count()) {
-                seen.note(&session, &case);
-                let taken = session.save();
-                assert_eq!(taken.step(), session.step_count());
-                saved.push((session.step_count(), taken.to_bytes()));
-            }
-            case.step(&mut session);
-            if session.step_count().is_multiple_of(TOLD_EVERY) {
-                course.push(told(&session));
-            }
+    let case = case(seed);
+    let mut random = Rng::with_seed(!seed);
+    let mut session = case.begin();
+    let stops: BTreeSet<u64> = (0..3).map(|_| random.u64(0..case.steps)).collect();
+    // The outputs, and the bytes at the stops.
+    let (mut course, mut saved) = (Vec::new(), Vec::new());
+    while session.step_count() < case.steps && session.hold_reason().is_none() {
+        if stops.contains(&session.step_count()) {
+            seen.note(&session, &case);
+            let taken = session.save();
+            assert_eq!(taken.step(), session.step_count());
+            saved.push((session.step_count(), taken.to_bytes()));
         }
-        let end = bytes_of(&session);
-        for (index, (step, bytes)) in saved.into_iter().enumerate() {
-            let lanes = (!widths.is_empty()).then(|| widths[index % widths.len()]);
-            let mut again = case.restored(&bytes, lanes);
-            assert_eq!(again.step_count(), step, "{}", case.about);
-            assert!(bytes_of(&again) == bytes, "{}: what was restored is not what was saved at {step}", case.about);
-            while again.step_count() < case.steps && again.hold_reason().is_none() {
-                case.step(&mut again);
-                let now = again.step_count();
-                if now.is_multiple_of(TOLD_EVERY) {
-                    let before = &course[(now / TOLD_EVERY) as usize - 1];
-                    assert_eq!(told(&again), *before, "{}: saved at {step}, step {now}", case.about);
-                }
-            }
-            assert!(bytes_of(&again) == end, "{}: saved at {step}, another state at the end", case.about);
-            tried += 1;
+        case.step(&mut session);
+        if session.step_count().is_multiple_of(TOLD_EVERY) {
+            course.push(told(&session));
         }
     }
-    println!("{tried} snapshots: {:?}", seen.0);
-    assert!(seen.0.values().all(|count| *count > 0), "{:?}", seen.0);
+    let end = bytes_of(&session);
+    for (index, (step, bytes)) in saved.into_iter().enumerate() {
+        let lanes = (!widths.is_empty()).then(|| widths[index % widths.len()]);
+        let mut again = case.restored(&bytes, lanes);
+        assert_eq!(again.step_count(), step, "{}", case.about);
+        assert!(bytes_of(&again) == bytes, "{}: what was restored is not what was saved at {step}", case.about);
+        while again.step_count() < case.steps && again.hold_reason().is_none() {
+            case.step(&mut again);
+            let now = again.step_count();
+            if now.is_multiple_of(TOLD_EVERY) {
+                let before = &course[(now / TOLD_EVERY) as usize - 1];
+                assert_eq!(told(&again), *before, "{}: saved at {step}, step {now}", case.about);
+            }
+        }
+        assert!(bytes_of(&again) == end, "{}: saved at {step}, another state at the end", case.about);
+        tried += 1;
+    }
+    (seen, tried)
 }
 
 /// A small session in which tools push, hold and touch, after some steps.

@@ -273,75 +273,81 @@ fn recovers(tissue: &mut dyn Tissue) -> bool {
 fn abused_solids_stay_finite_and_come_back_to_rest() {
     let from = cases::count("PALPATE_STRESS_SOLIDS_FROM", 0_u64, 0);
     let solids = cases::count("PALPATE_STRESS_SOLIDS", 4, 100);
-    let (mut played, mut guarded, mut recovered) = (0, 0, 0);
-    for seed in from..from + solids {
-        let mut case = solid_case(seed);
-        let dice = &mut fastrand::Rng::with_seed(seed);
-        case.scene += &format!(
-            "[[inclusion]]\ncentre_m = [0, 0, 0]\nradius_m = 0.01\nstiffness_factor = {:e}\n",
-            10_f64.powf(2.0 * dice.f64())
-        );
-        let limits = Limits { substeps: 400, ..Limits::default() };
-        let sets = ["stepping.tolerance=1e-2".to_owned(), "material.damping_per_s=30".to_owned()];
-        let Ok(scene) = random_scenes::scene(&case, &sets, &limits) else { continue };
-        let Ok(model) = Model::compile(&scene, &limits) else { continue };
-        let mut tissue = tissue::at_rest(&model);
-        let (shape, cell_m) = (scene.shape(), scene.shape().edge_m());
-        let (size_m, middle_m) = (shape.extent().size_m(), shape.extent().middle_m());
-        let hand_n = 0.2 * scene.springs.stiffness_n_per_m * cell_m;
-        played += 1;
-        for step in 0..300 {
-            if step % 15 == 0 {
-                let tool = dice.usize(0..3);
-                let mut within = || 2.0 * dice.f64() - 1.0;
-                let (side, towards) = (DVec3::new(within(), within(), 1.0), DVec3::new(within(), within(), within()));
-                match dice.u8(0..5) {
-                    0 => tissue.release(tool),
-                    1 | 2 => {
-                        // From the surface to a fifth of the height.
-                        let at = DVec3::new(0.4, 0.4, 0.5 - 0.8 * dice.f64()) * side * size_m;
-                        tissue.pose(
-                            tool,
-                            middle_m + at,
-                            Tip { radius_m: cell_m * (0.5 + 2.0 * dice.f64()), ..Tip::default() },
-                        );
-                    }
-                    3 => {
-                        let point = palpate_tissue::shape::PointId::new(dice.usize(0..shape.point_count()));
-                        if !shape.is_fixed(point) {
-                            tissue.grasp(tool, point, Grasp::Target(3.0 * cell_m * towards));
-                        }
-                    }
-                    _ => tissue.push(
+    let seeds: Vec<u64> = (from..from + solids).collect();
+    let played: Vec<_> = cases::on_every_core(&seeds, |seed| abused(*seed)).into_iter().flatten().collect();
+    let sum = |of: fn(&[u64; 2]) -> u64| played.iter().map(of).sum::<u64>();
+    let (guarded, recovered) = (sum(|of| of[0]), sum(|of| of[1]));
+    println!("{} of {solids} solids, {guarded} events of the guard, {recovered} recoveries", played.len());
+    assert!(2 * played.len() as u64 >= solids, "{} of {solids} were played", played.len());
+}
+
+/// Abuses a random solid. Returns the events of its guard and its recoveries; `None` if no solid comes of the seed.
+fn abused(seed: u64) -> Option<[u64; 2]> {
+    let mut recovered = 0;
+    let mut case = solid_case(seed);
+    let dice = &mut fastrand::Rng::with_seed(seed);
+    case.scene += &format!(
+        "[[inclusion]]\ncentre_m = [0, 0, 0]\nradius_m = 0.01\nstiffness_factor = {:e}\n",
+        10_f64.powf(2.0 * dice.f64())
+    );
+    let limits = Limits { substeps: 400, ..Limits::default() };
+    let sets = ["stepping.tolerance=1e-2".to_owned(), "material.damping_per_s=30".to_owned()];
+    let scene = random_scenes::scene(&case, &sets, &limits).ok()?;
+    let model = Model::compile(&scene, &limits).ok()?;
+    let mut tissue = tissue::at_rest(&model);
+    let (shape, cell_m) = (scene.shape(), scene.shape().edge_m());
+    let (size_m, middle_m) = (shape.extent().size_m(), shape.extent().middle_m());
+    let hand_n = 0.2 * scene.springs.stiffness_n_per_m * cell_m;
+    for step in 0..300 {
+        if step % 15 == 0 {
+            let tool = dice.usize(0..3);
+            let mut within = || 2.0 * dice.f64() - 1.0;
+            let (side, towards) = (DVec3::new(within(), within(), 1.0), DVec3::new(within(), within(), within()));
+            match dice.u8(0..5) {
+                0 => tissue.release(tool),
+                1 | 2 => {
+                    // From the surface to a fifth of the height.
+                    let at = DVec3::new(0.4, 0.4, 0.5 - 0.8 * dice.f64()) * side * size_m;
+                    tissue.pose(
                         tool,
-                        Some(Push::Constant(Poke {
-                            point: None,
-                            centre_m: middle_m + 0.4 * side * size_m,
-                            force_n: 100.0 * hand_n * towards,
-                            falloff_per_m: 10_f64.powf(dice.f64()) / cell_m,
-                            falloff_offset: 0.0,
-                        })),
-                    ),
+                        middle_m + at,
+                        Tip { radius_m: cell_m * (0.5 + 2.0 * dice.f64()), ..Tip::default() },
+                    );
                 }
-            }
-            recovered += u64::from(recovers(&mut *tissue));
-            if step % 10 == 0 {
-                assert!(all_finite(&*tissue), "{}, step {step}", case.about);
+                3 => {
+                    let point = palpate_tissue::shape::PointId::new(dice.usize(0..shape.point_count()));
+                    if !shape.is_fixed(point) {
+                        tissue.grasp(tool, point, Grasp::Target(3.0 * cell_m * towards));
+                    }
+                }
+                _ => tissue.push(
+                    tool,
+                    Some(Push::Constant(Poke {
+                        point: None,
+                        centre_m: middle_m + 0.4 * side * size_m,
+                        force_n: 100.0 * hand_n * towards,
+                        falloff_per_m: 10_f64.powf(dice.f64()) / cell_m,
+                        falloff_offset: 0.0,
+                    })),
+                ),
             }
         }
-        (0..3).for_each(|tool| tissue.release(tool));
-        guarded += tissue.guard_events();
-        // A soft solid under this damping creeps for seconds.
-        let mut waited = 0;
-        while waited < 20_000 && tissue.largest_displacement_m() >= 0.05 * cell_m {
-            recovered += u64::from(recovers(&mut *tissue));
-            waited += 1;
+        recovered += u64::from(recovers(&mut *tissue));
+        if step % 10 == 0 {
+            assert!(all_finite(&*tissue), "{}, step {step}", case.about);
         }
-        let left_m = tissue.largest_displacement_m();
-        assert!(left_m < 0.05 * cell_m, "{}: {:.3} cells from rest", case.about, left_m / cell_m);
     }
-    println!("{played} of {solids} solids, {guarded} events of the guard, {recovered} recoveries");
-    assert!(2 * played >= solids, "{played} of {solids} were played");
+    (0..3).for_each(|tool| tissue.release(tool));
+    let guarded = tissue.guard_events();
+    // A soft solid under this damping creeps for seconds.
+    let mut waited = 0;
+    while waited < 20_000 && tissue.largest_displacement_m() >= 0.05 * cell_m {
+        recovered += u64::from(recovers(&mut *tissue));
+        waited += 1;
+    }
+    let left_m = tissue.largest_displacement_m();
+    assert!(left_m < 0.05 * cell_m, "{}: {:.3} cells from rest", case.about, left_m / cell_m);
+    Some([guarded, recovered])
 }
 
 /// Scenes where only the damping is fast, dt·C/m from 0.7 to 90: `rk4` was stable by its vibrations alone, and grew.

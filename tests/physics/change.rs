@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crate::cases::on_every_core;
 use crate::common::{advance, scene_with};
 use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, told};
 use glam::DVec3;
@@ -156,7 +157,7 @@ fn a_change_in_full_motion_does_not_disturb_the_course() {
 
 #[test]
 fn extremes_stay_finite_and_end_in_balance() {
-    for sets in SCHEMES {
+    on_every_core(&SCHEMES, |sets| {
         let model = compile(sets);
         let mut tissue = poked(&model);
         step(&mut *tissue, 80);
@@ -178,7 +179,7 @@ fn extremes_stay_finite_and_end_in_balance() {
         step(&mut *fresh, 6000);
         let off_m = apart_m(&*tissue, &places(&*fresh));
         assert!(off_m < 1e-4 * fresh.largest_displacement_m(), "{sets:?}: {off_m}");
-    }
+    });
 }
 
 #[test]

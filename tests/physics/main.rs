@@ -7,6 +7,8 @@
     clippy::disallowed_methods
 )]
 
+#[path = "../common/cases.rs"]
+mod cases;
 #[path = "../common/mod.rs"]
 mod common;
 #[path = "../common/server.rs"]

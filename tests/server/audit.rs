@@ -345,10 +345,20 @@ fn coarse(correct: bool) -> Source {
 
 /// Pushes up and down until the status is as `wanted`.
 async fn push_until(server: &TestServer, session_id: &str, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
+    let pushed = |sequence: u64| force(0, sequence, if sequence.is_multiple_of(2) { -1.0 } else { -2.0 });
+    command_until(server, session_id, pushed, wanted).await
+}
+
+async fn command_until(
+    server: &TestServer,
+    session_id: &str,
+    command: impl Fn(u64) -> pb::Command,
+    wanted: impl Fn(&pb::Session) -> bool,
+) -> pb::Session {
     let touch = TestTouch::hold(server, session_id).await;
     let begun = Instant::now();
     for sequence in 1.. {
-        touch.command(force(0, sequence, if sequence % 2 == 0 { -1.0 } else { -2.0 })).await;
+        touch.command(command(sequence)).await;
         tokio::time::sleep(std::time::Duration::from_millis(20)).await;
         let status = server.status(session_id).await;
         if wanted(&status) {
@@ -383,6 +393,28 @@ async fn a_live_session_tells_its_audited_error_and_why() {
     assert_eq!(value("palpate_corrections_total"), 0.0);
     let log = server.log();
     assert!(log.contains("audited error above the tolerance") && log.contains("substep"), "{log}");
+}
+
+#[tokio::test]
+async fn a_live_solid_tells_the_error_of_its_cells_and_a_sheet_has_none() {
+    let server = TestServer::start(&["--audit-share", "0.5"]);
+    let phantom = server.create(Source::SceneName("phantom".into()), false).await.unwrap();
+    assert_eq!(phantom.mesh_error_estimate, None);
+    let is_known = |status: &pb::Session| status.mesh_error_estimate.is_some();
+    let top_m = phantom.extent.unwrap().top_m;
+    let pushed = |sequence: u64| {
+        let mut command = force(0, sequence, -1e-3 * (1 + sequence % 2) as f64);
+        let Some(pb::command::Action::Force(force)) = &mut command.action else { unreachable!() };
+        force.centre = top_m.map(pb::force::Centre::AtM);
+        command
+    };
+    let status = command_until(&server, &phantom.session_id, pushed, is_known).await;
+    let estimate = status.mesh_error_estimate.unwrap();
+    assert!((0.0..0.5).contains(&estimate.relative) && estimate.stiffness_n_per_m > 0.0, "{estimate:?}");
+    assert_eq!(estimate.radius_m, Tip::default().radius_m);
+    let sheet = server.create(coarse(false), false).await.unwrap();
+    let status = push_until(&server, &sheet.session_id, |status| status.audit.is_some()).await;
+    assert_eq!(status.mesh_error_estimate, None);
 }
 
 #[tokio::test]

@@ -160,7 +160,7 @@ fn a_tile_drifts_by_the_force_on_its_nearest_point() {
     for tile in [4, 5, 7, 8] {
         let [rows, columns] = sides_of(&layout(), tile);
         let points = rows.flat_map(|i| columns.clone().map(move |j| place(i as f64, j as f64)));
-        let nearest_m = points.map(|point_m| point_m.distance(centre_m)).fold(f64::INFINITY, f64::min);
+        let nearest_m = points.map(|point_m| point_m.distance(centre_m)).min_by(f64::total_cmp).unwrap();
         let expected_n = (-falloff_per_m * nearest_m).exp();
         assert!((tiles.drift_n[tile] - expected_n).abs() < 1e-9, "{tile}: {} N {expected_n}", tiles.drift_n[tile]);
     }
