@@ -27,6 +27,7 @@ mod slowest;
 
 pub use fixed::FixedPart;
 pub use layer::Layer;
+use shape::places_in_cube;
 pub use shape::{CellSize, SolidShape};
 use slowest::SlowestVibration;
 
@@ -420,14 +421,8 @@ impl Inclusion {
     /// Returns how much of a cube is inside a ball, 0 to 1: the mean of [`Inclusion`]'s p at `looks`³ places.
     fn mean_part(&self, lattice: &Lattice, cell: [usize; 3], looks: usize) -> f64 {
         let Region::Ball { centre_m, radius_m } = &self.region else { return 0.0 };
-        let step_m = lattice.edge_m / looks as f64;
-        let first_m = lattice.middle_m(cell) - 0.5 * (lattice.edge_m - step_m);
-        let mut sum = 0.0;
-        for look in 0..looks.pow(3) {
-            let at = [look % looks, look / looks % looks, look / looks / looks].map(|at| at as f64);
-            let beyond_m = (first_m + step_m * glam::DVec3::from_array(at)).distance(*centre_m) - radius_m;
-            sum += self.part_beyond(beyond_m);
-        }
+        let places = places_in_cube(lattice.middle_m(cell), lattice.edge_m, looks);
+        let sum: f64 = places.map(|place_m| self.part_beyond(place_m.distance(*centre_m) - radius_m)).sum();
         sum / looks.pow(3) as f64
     }
 }

@@ -5,7 +5,7 @@ use glam::DVec3;
 use palpate_geometry::fill::Lattice;
 use palpate_geometry::surface::Surface;
 
-use super::shape::SolidShape;
+use super::shape::{SolidShape, places_in_cube};
 use crate::scene::toml_document::Item;
 use palpate_refusal::{Reason, Refusal, Result, number, positive};
 
@@ -87,14 +87,10 @@ fn beneath(surface: &Surface, place_m: DVec3) -> Option<(f64, DVec3)> {
 /// tool presses layers in a row. (Layers of 1 and 2 mm, 0.2 and 10 times as stiff, under a disc of 5 mm, full cells of 2.5 to
 /// 5 mm: −9 to +9 % of the stiffness with cells of 1 mm; with the geometric mean to +28 %, with the arithmetic one to +71 %.)
 /// The surface counts as flat across the cube.
-#[allow(clippy::cast_precision_loss)]
 fn mean_factor(layers: &[Layer], lattice: &Lattice, depth_m: f64, outward: DVec3) -> f64 {
-    let step_m = lattice.edge_m / LOOKS as f64;
-    let first_m = DVec3::splat(0.5 * (step_m - lattice.edge_m));
     let (mut sum, mut count) = (0.0, 0);
-    for look in 0..LOOKS.pow(3) {
-        let at = [look % LOOKS, look / LOOKS % LOOKS, look / LOOKS / LOOKS].map(|at| at as f64);
-        let mut left_m = depth_m - (first_m + step_m * DVec3::from_array(at)).dot(outward);
+    for away_m in places_in_cube(DVec3::ZERO, lattice.edge_m, LOOKS) {
+        let mut left_m = depth_m - away_m.dot(outward);
         if left_m < 0.0 {
             continue;
         }

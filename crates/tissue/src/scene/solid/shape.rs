@@ -427,6 +427,17 @@ fn whole(number: f64) -> usize {
     number.max(0.0) as usize
 }
 
+/// Returns `looks`³ places in a cube, evenly apart, m.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn places_in_cube(middle_m: DVec3, edge_m: f64, looks: usize) -> impl Iterator<Item = DVec3> {
+    let step_m = edge_m / looks as f64;
+    let first_m = middle_m - 0.5 * (edge_m - step_m);
+    (0..looks.pow(3)).map(move |look| {
+        let at = [look % looks, look / looks % looks, look / looks / looks].map(|at| at as f64);
+        first_m + step_m * DVec3::from_array(at)
+    })
+}
+
 fn added(cell: [usize; 3], by: [usize; 3]) -> [usize; 3] {
     std::array::from_fn(|axis| cell[axis] + by[axis])
 }

@@ -90,21 +90,14 @@ impl MixedCells {
         let count = corners.iter().product();
         let mut found =
             MixedCells { by, cells: Vec::new(), masses: vec![0.0; count], alone: vec![0.0; count], shear, lame };
-        for k in 0..cells[2] {
-            for j in 0..cells[1] {
-                for i in 0..cells[0] {
-                    let [weight, part] = mixed[index([i, j, k])];
-                    if weight <= 0.0 {
-                        continue;
-                    }
-                    let corners = CORNERS.map(|[x, y, z]| corner([i + x, j + y, k + z]));
-                    for corner in corners {
-                        found.masses[corner] += 0.125 * part;
-                        found.alone[corner] += weight * (lame + 19.0 / 3.0 * shear) / 16.0;
-                    }
-                    found.cells.push(MixedCell { corners, weight });
-                }
+        for (at, [weight, part]) in mixed.into_iter().enumerate().filter(|(_, [weight, _])| *weight > 0.0) {
+            let [i, j, k] = [at % cells[0], at / cells[0] % cells[1], at / cells[0] / cells[1]];
+            let corners = CORNERS.map(|[x, y, z]| corner([i + x, j + y, k + z]));
+            for corner in corners {
+                found.masses[corner] += 0.125 * part;
+                found.alone[corner] += weight * (lame + 19.0 / 3.0 * shear) / 16.0;
             }
+            found.cells.push(MixedCell { corners, weight });
         }
         for point in crate::shape::points(shape) {
             if shape.is_fixed(point) {
@@ -171,8 +164,8 @@ impl MixedCells {
                 let turned = DVec3::new(along[0][axis], along[1][axis], along[2][axis]);
                 lame * growth * DVec3::AXES[axis] + shear * (along[axis] + turned)
             });
-            let others = [2.0, 2.0, 2.0, 1.0].map(|part| part / 3.0 * shear).into_iter().zip(others);
-            let others: Vec<DVec3> = others.map(|(by, other)| by * other).collect();
+            let parts: [f64; 4] = [2.0, 2.0, 2.0, 1.0];
+            let others: [DVec3; 4] = std::array::from_fn(|way| parts[way] / 3.0 * shear * others[way]);
             for (corner, point) in corners.iter().enumerate() {
                 let [x, y, z] = signs(corner);
                 let of_stress = x * stress[0] + y * stress[1] + z * stress[2];
