@@ -12,7 +12,7 @@ use pb::touch_response::Message as Heard;
 use prost::Message;
 
 use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, open};
-use crate::{ALONE, compiled, compiled_cs, done, folder, has_mono, mono, ours, root, told};
+use crate::{compiled, compiled_cs, done, folder, has_mono, mono, ours, root, told};
 
 /// What happened at the client, in order.
 enum ClientEvent {
@@ -143,10 +143,13 @@ fn assert_same_forces(name: &str, middle_m: DVec3, events: &[ClientEvent]) {
     }
 }
 
+/// Both tests compile to the same files.
+static COMPILED: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
+
 /// The record that the tests of Python render too. PALPATE_RECORD=1 makes it anew.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_kept_record_gives_the_same_forces_in_every_language() {
-    let _alone = ALONE.lock().await;
+    let _turn = COMPILED.lock().await;
     let kept = root().join("tests/abi/touch.record");
     if std::env::var_os("PALPATE_RECORD").is_some() {
         let server = TestServer::start(&[]);
@@ -161,7 +164,7 @@ async fn the_kept_record_gives_the_same_forces_in_every_language() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_force_course_is_the_same_in_every_language() {
-    let _alone = ALONE.lock().await;
+    let _turn = COMPILED.lock().await;
     let server = TestServer::start(&[]);
     let (middle_m, events) =
         tokio::time::timeout(TEST_TIMEOUT, recorded(&server, 1)).await.expect("the server is silent");

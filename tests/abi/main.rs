@@ -11,13 +11,14 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use server::TestServer;
+use tokio::sync::Semaphore;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Forces at a thousand a second need a core: one test at a time.
-static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
+/// Tests at a time: forces at a thousand a second need part of a core.
+static TURNS: Semaphore = Semaphore::const_new(2);
 
 /// Where everything is installed and compiled.
 fn folder() -> PathBuf {
@@ -105,9 +106,9 @@ fn assert_looked(output: &Output, heights: &str) {
 
 const RUN: [&str; 2] = ["liver", "2"];
 
-#[test]
-fn examples_in_c_press_look_and_connect_a_device() {
-    let _alone = ALONE.blocking_lock();
+#[tokio::test]
+async fn examples_in_c_press_look_and_connect_a_device() {
+    let _turn = TURNS.acquire().await.unwrap();
     let server = TestServer::start(&[]);
     let run = |program: &Path| done(ours(program).arg(&server.url).args(RUN));
     let touch = compiled("clients/c/examples/touch.c", &[]);
@@ -130,9 +131,9 @@ fn examples_in_c_press_look_and_connect_a_device() {
 }
 
 /// On an organ the middle of the tissue is inside it.
-#[test]
-fn the_touch_of_the_example_finds_the_surface_of_a_mesh_and_is_in_the_static_library() {
-    let _alone = ALONE.blocking_lock();
+#[tokio::test]
+async fn the_touch_of_the_example_finds_the_surface_of_a_mesh_and_is_in_the_static_library() {
+    let _turn = TURNS.acquire().await.unwrap();
     let server = TestServer::start(&[]);
     let archive = prefix().join("lib/libpalpate.a");
     let program = folder().join("touch-static");
@@ -144,19 +145,19 @@ fn the_touch_of_the_example_finds_the_surface_of_a_mesh_and_is_in_the_static_lib
     }
 }
 
-#[test]
-fn what_is_wrong_in_c_is_an_error_with_words() {
-    let _alone = ALONE.blocking_lock();
+#[tokio::test]
+async fn what_is_wrong_in_c_is_an_error_with_words() {
+    let _turn = TURNS.acquire().await.unwrap();
     let server = TestServer::start(&[]);
     done(ours(&compiled("clients/c/tests/errors.c", &[])).arg(&server.url));
 }
 
-#[test]
-fn examples_in_cpp_press_look_and_show() {
+#[tokio::test]
+async fn examples_in_cpp_press_look_and_show() {
     if !has("c++", "g++") {
         return;
     }
-    let _alone = ALONE.blocking_lock();
+    let _turn = TURNS.acquire().await.unwrap();
     let server = TestServer::start(&[]);
     let run = |program: &Path| done(ours(program).arg(&server.url).args(RUN));
     assert_looked(&run(&compiled("clients/cpp/examples/look.cpp", &["-fno-exceptions"])), "z_m");
@@ -197,12 +198,12 @@ fn mono(program: &Path) -> Command {
     command
 }
 
-#[test]
-fn examples_in_cs_press_look_and_show() {
+#[tokio::test]
+async fn examples_in_cs_press_look_and_show() {
     if !has_mono() {
         return;
     }
-    let _alone = ALONE.blocking_lock();
+    let _turn = TURNS.acquire().await.unwrap();
     let server = TestServer::start(&[]);
     let run = |program: &Path| done(mono(program).arg(&server.url).args(RUN));
     assert_looked(&run(&compiled_cs("clients/csharp/examples/Look.cs")), "y_m");

@@ -22,8 +22,8 @@ use tonic::Status;
 
 use super::server::{TEST_TIMEOUT, TestServer};
 
-/// One fleet at a time: each has several processes, and some have clients at 1 kHz.
-pub static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
+/// Fleets at a time: each has several processes, and some have clients at 1 kHz. Most of them wait for most of their time.
+pub static FLEETS: tokio::sync::Semaphore = tokio::sync::Semaphore::const_new(3);
 
 /// A port that is free now.
 pub fn port() -> u16 {

@@ -362,6 +362,9 @@ async fn command_until(
         tokio::time::sleep(std::time::Duration::from_millis(20)).await;
         let status = server.status(session_id).await;
         if wanted(&status) {
+            // So that the next to push can hold the tool.
+            drop(touch);
+            server.until_let_go().await;
             return status;
         }
         assert!(begun.elapsed() < TEST_TIMEOUT, "{status:?}");

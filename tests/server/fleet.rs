@@ -9,27 +9,27 @@ use std::time::Duration;
 
 use crate::common::authority::Authority;
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{self, ALONE, create, goes_on, owner, three, until, until_stood_by, verify};
+use crate::common::fleet::{self, FLEETS, create, goes_on, owner, three, until, until_stood_by, verify};
 use crate::common::server::{self, TestServer, TestTouch, force, waiting};
 use palpate_proto::pb;
 use palpate_refusal::status::elsewhere;
 use palpate_session::journal::file;
 use pb::touch_response::Message as Heard;
 use tempfile::TempDir;
-use tokio::sync::MutexGuard;
+use tokio::sync::SemaphorePermit;
 use tonic::Code;
 
-/// A folder and an etcd, while no other test runs. `None` where etcd is not installed.
-async fn alone() -> Option<(MutexGuard<'static, ()>, TempDir, EtcdMembers)> {
+/// A turn, a folder and an etcd. `None` where etcd is not installed.
+async fn fleet_turn() -> Option<(SemaphorePermit<'static>, TempDir, EtcdMembers)> {
     if !EtcdMembers::is_there() {
         return None;
     }
-    Some((ALONE.lock().await, tempfile::tempdir().unwrap(), EtcdMembers::start(1)))
+    Some((FLEETS.acquire().await.unwrap(), tempfile::tempdir().unwrap(), EtcdMembers::start(1)))
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn any_server_creates_sessions_and_tells_where_they_are() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let mut made = BTreeMap::new();
     for index in 0..9 {
@@ -101,7 +101,7 @@ async fn a_server_of_no_fleet_says_so() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_frozen_server_says_nothing_for_its_sessions_when_it_thaws() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, session) = until_stood_by(&nodes, &id).await;
@@ -148,7 +148,7 @@ async fn a_frozen_server_says_nothing_for_its_sessions_when_it_thaws() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn without_etcd_all_stands_and_then_goes_on_in_place() {
-    let Some((_one, folder, mut etcd)) = alone().await else { return };
+    let Some((_turn, folder, mut etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, before) = until_stood_by(&nodes, &id).await;
@@ -185,7 +185,7 @@ async fn without_etcd_all_stands_and_then_goes_on_in_place() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_whose_owner_is_changed_by_hand_ends_at_its_old_server() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let at = owner(&nodes, &id).await.unwrap();
@@ -205,7 +205,7 @@ async fn a_session_whose_owner_is_changed_by_hand_ends_at_its_old_server() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_moves_with_its_tools_and_the_same_bits() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let mut at = owner(&nodes, &id).await.unwrap();
@@ -271,7 +271,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_change_of_the_tissue_that_waits_goes_on_at_the_server_that_takes_over() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let mut nodes = three(folder.path(), &etcd.endpoints()).await;
     let paper = pb::create_session_request::Source::SceneName("paper".into());
     let id = nodes[0].there().create(paper, true).await.unwrap().session_id;
@@ -305,7 +305,7 @@ fn force_n(sample: &pb::Sample) -> f64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let authority = Authority::new();
     let write = |name: &str, text: &str| {
         let path = folder.path().join(name);

@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{ALONE, Node, create, goes_on, three, until, verify};
+use crate::common::fleet::{FLEETS, Node, create, goes_on, three, until, verify};
 use crate::common::proxy::Proxy;
 use crate::common::random::TestRandom;
 use crate::common::server::{TestTouch, force};
@@ -182,7 +182,7 @@ async fn rounds() {
     if !EtcdMembers::is_there() {
         return;
     }
-    let _one = ALONE.lock().await;
+    let _turn = FLEETS.acquire().await.unwrap();
     let (rounds, mut random) = (number("PALPATE_FLEET_ROUNDS", 4), TestRandom(number("PALPATE_FLEET_SEED", 1)));
     let (sessions, resting) = (number("PALPATE_FLEET_SESSIONS", 3), number("PALPATE_FLEET_RESTING", 3));
     let frozen = Duration::from_secs(number("PALPATE_FLEET_FROZEN_S", 4));
@@ -327,7 +327,7 @@ async fn etcds_leader_is_killed() {
     if !EtcdMembers::is_there() {
         return;
     }
-    let _one = ALONE.lock().await;
+    let _turn = FLEETS.acquire().await.unwrap();
     let (leaders, sessions) = (number("PALPATE_FLEET_LEADERS", 2), number("PALPATE_FLEET_SESSIONS", 3));
     let mut etcd = EtcdMembers::start(3);
     let ward = Ward::open(&vec![etcd.endpoints(); 3], sessions, 4, 0).await;
@@ -374,7 +374,7 @@ async fn etcd_is_gone() {
     if !EtcdMembers::is_there() {
         return;
     }
-    let _one = ALONE.lock().await;
+    let _turn = FLEETS.acquire().await.unwrap();
     let (gone_s, sessions) = (number("PALPATE_FLEET_GONE_S", 60), number("PALPATE_FLEET_SESSIONS", 3));
     let mut etcd = EtcdMembers::start(3);
     let ward = Ward::open(&vec![etcd.endpoints(); 3], sessions, 1, 3).await;
@@ -459,7 +459,7 @@ async fn moves_under_a_tool() {
     if !EtcdMembers::is_there() {
         return;
     }
-    let _one = ALONE.lock().await;
+    let _turn = FLEETS.acquire().await.unwrap();
     let moves = number("PALPATE_FLEET_MOVES", 12);
     let mut random = TestRandom(number("PALPATE_FLEET_SEED", 1));
     let etcd = EtcdMembers::start(1);

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{self, ALONE, Node, until, until_stood_by};
+use crate::common::fleet::{self, FLEETS, Node, until, until_stood_by};
 use glam::DVec3;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, run};
 use palpate_client::{Credentials, HapticDevice, Reading};
@@ -212,7 +212,7 @@ async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
     if !EtcdMembers::is_there() {
         return;
     }
-    let _one = ALONE.lock().await;
+    let _turn = FLEETS.acquire().await.unwrap();
     let folder = tempfile::tempdir().unwrap();
     let etcd = EtcdMembers::start(1);
     let nodes = two(folder.path(), &etcd.endpoints()).await;
@@ -267,7 +267,7 @@ async fn a_hand_whose_server_dies_rests_until_it_asks_for_forces() {
     if !EtcdMembers::is_there() {
         return;
     }
-    let _one = ALONE.lock().await;
+    let _turn = FLEETS.acquire().await.unwrap();
     let folder = tempfile::tempdir().unwrap();
     let etcd = EtcdMembers::start(1);
     let mut nodes = two(folder.path(), &etcd.endpoints()).await;

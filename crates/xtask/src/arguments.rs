@@ -22,7 +22,7 @@ pub(crate) enum ProjectTask {
     Page,
 }
 
-/// A part of the tests, in the order of `PARTS`.
+/// A part of the tests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TestPart {
     Viewer,
@@ -33,7 +33,7 @@ pub(crate) enum TestPart {
     Documents,
 }
 
-/// The parts of the tests by their names, in the order in which they run.
+/// The parts of the tests by their names.
 pub(crate) const PARTS: [(&str, TestPart); 6] = [
     ("viewer", TestPart::Viewer),
     ("python", TestPart::Python),

@@ -47,11 +47,13 @@ pub(crate) fn execute(stages: &[PlanStage]) -> Result<(), TaskFailure> {
             PlanStage::Step(step) => run(step)?,
             PlanStage::Beside { step, others, without } => {
                 let (ended, beside) = run_with(step, others);
-                if let Err(failure) = beside {
-                    eprintln!("{failure}");
-                    eprintln!("{without}");
+                match (beside, without) {
+                    (Err(failure), Some(without)) => {
+                        eprintln!("{failure}\n{without}");
+                        ended?;
+                    }
+                    (beside, _) => ended.and(beside)?,
                 }
-                ended?;
             }
             PlanStage::Mark(file) => {
                 std::fs::write(file, "")

@@ -1,6 +1,6 @@
 //! The commands of each task, in their order, as data: what runs is what `--plan` prints.
 
-use crate::arguments::{PARTS, ProjectTask, TestPart};
+use crate::arguments::{ProjectTask, TestPart};
 use crate::execute::TaskFailure;
 use crate::system::{REQUIREMENTS, System, VENV_READY};
 
@@ -22,8 +22,9 @@ pub(crate) struct Step {
 pub(crate) enum PlanStage {
     /// A command; the plan ends if it fails.
     Step(Step),
-    /// A command, and others at the same time that may fail. If one does, the rest of them do not run, and this text is printed.
-    Beside { step: Step, others: Vec<Step>, without: &'static str },
+    /// A command, and others at the same time, one after another. If one of those fails, the rest of them do not run. The plan ends
+    /// then, unless there is a text: that is printed.
+    Beside { step: Step, others: Vec<Step>, without: Option<&'static str> },
     /// Writes an empty file, which says that the stages before it are done.
     Mark(&'static str),
     /// Prints what is left out, and why.
@@ -46,6 +47,14 @@ fn step(program: &str, arguments: &[&str]) -> Step {
         arguments: arguments.iter().map(|&one| one.to_owned()).collect(),
         ..Step::default()
     }
+}
+
+/// Returns the stage of commands of which the first runs beside all others.
+fn beside(steps: Vec<Step>) -> Option<PlanStage> {
+    let mut steps = steps.into_iter();
+    let step = steps.next()?;
+    let others: Vec<Step> = steps.collect();
+    Some(if others.is_empty() { PlanStage::Step(step) } else { PlanStage::Beside { step, others, without: None } })
 }
 
 /// Returns the stages of a task on a system.
@@ -116,7 +125,7 @@ impl System {
         let mut stages = Vec::new();
         match self.has_node {
             true if self.page().is_empty() => stages.push(PlanStage::Step(programs)),
-            true => stages.push(PlanStage::Beside { step: programs, others: self.page(), without: WITHOUT_PAGE }),
+            true => stages.push(PlanStage::Beside { step: programs, others: self.page(), without: Some(WITHOUT_PAGE) }),
             false => {
                 let missing = format!("`{}` is not Node.js 20.19 or later. {WITHOUT_PAGE}", self.node);
                 stages.extend([PlanStage::Note(missing), PlanStage::Step(programs)]);
@@ -143,39 +152,45 @@ impl System {
             self.need_python()?;
             stages.extend(self.venv());
         }
-        for (_, part) in PARTS.into_iter().filter(|(_, part)| is_asked(*part)) {
-            match part {
-                TestPart::Viewer => {
-                    self.need_node()?;
-                    let tests = ["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"]));
-                    stages.extend(self.page().into_iter().chain(tests).map(PlanStage::Step));
-                }
-                // The tools for building are those of the environment, so that pip makes none of its own; what is compiled is
-                // what the first stage has compiled.
-                TestPart::Python => {
-                    let install = ["--no-build-isolation", "--no-deps", "--force-reinstall", "./clients/python"];
-                    let install = Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) };
-                    stages.extend([install, self.unittest("clients/python/tests")].map(PlanStage::Step));
-                }
-                TestPart::Protocol => {
-                    let format = Step { folder: "proto/generator", ..self.cargo(&["fmt", "--check"]) };
-                    let generator = ["test", "--quiet", "--locked", "--target-dir", "../../target/generator"];
-                    let compare = Step { folder: "proto/generator", ..self.cargo(&generator) };
-                    stages.extend([PlanStage::Step(format), PlanStage::Step(compare)]);
-                }
-                TestPart::Rust => stages.push(self.rust_tests()),
-                TestPart::Abi if self.has_shell && !self.is_windows => {
-                    let built = format!("{}/release", self.target);
-                    stages.push(PlanStage::Step(step("sh", &["tests/abi/check.sh", &built, "interface"])));
-                }
-                TestPart::Abi if asked.is_empty() => {
-                    let reason = "the comparison of libpalpate's interface: it needs a Unix with a POSIX shell";
-                    stages.push(PlanStage::Note(format!("left out: {reason}")));
-                }
-                TestPart::Abi => {
-                    return Err(TaskFailure::missing("a Unix with a POSIX shell", "the part `abi` can't run here"));
-                }
-                TestPart::Documents => stages.push(PlanStage::Step(self.unittest("tests/python"))),
+        if is_asked(TestPart::Viewer) {
+            self.need_node()?;
+            let tests = ["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"]));
+            stages.extend(self.page().into_iter().chain(tests).map(PlanStage::Step));
+        }
+        // These wait for most of their time, so that they run at once.
+        let mut waiting = Vec::new();
+        if is_asked(TestPart::Python) {
+            // The tools for building are those of the environment, so that pip makes none of its own; what is compiled is what
+            // the first stage has compiled.
+            let as_compiled = "--config-settings=build-args=--features=workspace-features";
+            let install = ["--no-build-isolation", "--no-deps", "--force-reinstall", as_compiled, "./clients/python"];
+            let install = Step { path: Some(self.venv_programs().to_owned()), ..self.pip(&install) };
+            stages.push(PlanStage::Step(install));
+            waiting.push(self.unittest("clients/python/tests"));
+        }
+        if is_asked(TestPart::Protocol) {
+            let generator = ["test", "--quiet", "--locked", "--target-dir", "../../target/generator"];
+            waiting.extend(
+                [&["fmt", "--check"][..], &generator]
+                    .map(|arguments| Step { folder: "proto/generator", ..self.cargo(arguments) }),
+            );
+        }
+        if is_asked(TestPart::Documents) {
+            waiting.push(self.unittest("tests/python"));
+        }
+        stages.extend(beside(waiting));
+        if is_asked(TestPart::Rust) {
+            stages.push(self.rust_tests());
+        }
+        if is_asked(TestPart::Abi) {
+            if self.has_shell && !self.is_windows {
+                let built = format!("{}/release", self.target);
+                stages.push(PlanStage::Step(step("sh", &["tests/abi/check.sh", &built, "interface"])));
+            } else if asked.is_empty() {
+                let reason = "the comparison of libpalpate's interface: it needs a Unix with a POSIX shell";
+                stages.push(PlanStage::Note(format!("left out: {reason}")));
+            } else {
+                return Err(TaskFailure::missing("a Unix with a POSIX shell", "the part `abi` can't run here"));
             }
         }
         Ok(stages)
@@ -226,9 +241,10 @@ pub(crate) fn shown(stages: &[PlanStage]) -> String {
     for stage in stages {
         match stage {
             PlanStage::Step(step) => add(step.to_string()),
-            PlanStage::Beside { step, others, .. } => {
+            PlanStage::Beside { step, others, without } => {
                 add(step.to_string());
-                others.iter().for_each(|other| add(format!("{other}   # at the same time; may fail")));
+                let may_fail = if without.is_some() { "; may fail" } else { "" };
+                others.iter().for_each(|other| add(format!("{other}   # at the same time{may_fail}")));
             }
             PlanStage::Mark(file) => add(format!("# marks {file}")),
             PlanStage::Note(text) => add(format!("# {text}")),
@@ -332,13 +348,13 @@ mod tests {
                 "(in clients/viewer) npm test",
                 "(in clients/typescript) npm test",
                 "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
-                 --force-reinstall ./clients/python",
+                 --force-reinstall --config-settings=build-args=--features=workspace-features ./clients/python",
                 "target/venv/bin/python -m unittest discover -s clients/python/tests -v",
-                "(in proto/generator) cargo fmt --check",
-                "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator",
+                "(in proto/generator) cargo fmt --check   # at the same time",
+                "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator   # at the same time",
+                "target/venv/bin/python -m unittest discover -s tests/python -v   # at the same time",
                 "PROPTEST_RNG_SEED=20261122 RUST_TEST_THREADS=6 cargo test --release --workspace --no-fail-fast",
                 "sh tests/abi/check.sh target/release interface",
-                "target/venv/bin/python -m unittest discover -s tests/python -v",
             ]
         );
         let windows = lines(&ProjectTask::Test(vec![]), &built(true));

@@ -8,7 +8,7 @@ use palpate_proto::pb;
 use palpate_session::journal::file;
 use tonic::Code;
 
-use super::alone;
+use super::fleet_turn;
 use crate::common::etcd::EtcdMembers;
 use crate::common::fleet::{Node, create, owner, three, until, until_stood_by};
 use crate::common::random::TestRandom;
@@ -24,7 +24,7 @@ fn run(session: &pb::Session) -> u64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_stays_if_the_other_server_can_not_write_its_journal() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, before) = until_stood_by(&nodes, &id).await;
@@ -70,7 +70,7 @@ async fn being_named(nodes: &[Node], etcd: &EtcdMembers) -> (String, usize) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_moves_also_while_its_standby_is_being_named() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = patient(folder.path(), &etcd).await;
     for _ in 0..4 {
         let (id, at) = being_named(&nodes, &etcd).await;
@@ -98,7 +98,7 @@ async fn a_session_moves_also_while_its_standby_is_being_named() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_move_is_refused_with_the_reason_if_etcd_does_not_say_who_stands_by() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let nodes = patient(folder.path(), &etcd).await;
     let mut refused = None;
     for _ in 0..5 {
@@ -126,7 +126,7 @@ async fn a_move_is_refused_with_the_reason_if_etcd_does_not_say_who_stands_by() 
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_has_one_server_whenever_the_one_that_takes_it_dies() {
-    let Some((_one, folder, etcd)) = alone().await else { return };
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
     let mut nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (mut random, mut revision, mut durable_step) = (TestRandom(7), 0, 0);
@@ -157,7 +157,7 @@ async fn a_session_has_one_server_whenever_the_one_that_takes_it_dies() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_deletion_is_confirmed_only_when_etcd_has_done_it() {
-    let Some((_one, folder, mut etcd)) = alone().await else { return };
+    let Some((_turn, folder, mut etcd)) = fleet_turn().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, _) = until_stood_by(&nodes, &id).await;
