@@ -24,9 +24,16 @@ struct FarArea {
     area_m2: DVec3,
 }
 
-/// Triangles, ordered for the sum.
+/// Triangles, ordered for the sum. Those of different sizes are apart: a long triangle among short ones would make their node
+/// large, and so near for places that are far from the short ones.
 #[derive(Debug)]
 pub(crate) struct Winding {
+    sizes: Vec<SizeClass>,
+}
+
+/// Triangles of about the same size.
+#[derive(Debug)]
+struct SizeClass {
     tree: Tree,
     /// Of each node.
     areas: Vec<FarArea>,
@@ -50,21 +57,19 @@ impl FarArea {
     }
 }
 
-impl Winding {
-    /// Orders triangles. All coordinates must be finite, and all indices in range.
-    pub(crate) fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Self {
-        let tree = Tree::new(vertices_m, triangles, (0..).take(triangles.len()));
+impl SizeClass {
+    fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]], of: &[u32]) -> Self {
+        let tree = Tree::new(vertices_m, triangles, of.iter().copied());
         let of = |triangle: &u32| corners(vertices_m, triangles[*triangle as usize]);
         let triangles_m: Vec<[DVec3; 3]> = tree.order().iter().map(of).collect();
         let areas = (0..tree.len()).map(|node| FarArea::of(&triangles_m[tree.range(node)])).collect();
-        Winding { tree, areas, triangles_m }
+        SizeClass { tree, areas, triangles_m }
     }
 
-    /// Returns the winding number around a place that is on no triangle: 1 inside of a closed surface that faces outward, 0
-    /// outside, and between them near holes.
-    pub(crate) fn around(&self, place_m: DVec3) -> f64 {
+    /// Adds up the solid angles of the triangles, as seen from a place. `waiting` is empty before and after.
+    fn angle(&self, place_m: DVec3, waiting: &mut Vec<usize>) -> f64 {
         let mut angle = 0.0;
-        let mut waiting = if self.areas.is_empty() { Vec::new() } else { vec![0] };
+        waiting.push(0);
         while let Some(node) = waiting.pop() {
             let area = &self.areas[node];
             let away = area.middle_m - place_m;
@@ -78,7 +83,35 @@ impl Winding {
                 angle += self.triangles_m[self.tree.range(node)].iter().map(|of| solid_angle(of, place_m)).sum::<f64>();
             }
         }
-        angle / (4.0 * PI)
+        angle
+    }
+}
+
+/// Returns the class of a triangle's size: the next begins at four times the length.
+fn size_class([a, b, c]: [DVec3; 3]) -> i32 {
+    let longest = a.distance_squared(b).max(b.distance_squared(c)).max(c.distance_squared(a));
+    libm::ilogb(longest).div_euclid(4)
+}
+
+impl Winding {
+    /// Orders triangles. All coordinates must be finite, and all indices in range.
+    pub(crate) fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Self {
+        let class = |triangle: u32| size_class(corners(vertices_m, triangles[triangle as usize]));
+        let mut order: Vec<(i32, u32)> =
+            (0..).take(triangles.len()).map(|triangle| (class(triangle), triangle)).collect();
+        order.sort_unstable();
+        let of_class = |all: &[(i32, u32)]| {
+            let of: Vec<u32> = all.iter().map(|(_, triangle)| *triangle).collect();
+            SizeClass::new(vertices_m, triangles, &of)
+        };
+        Winding { sizes: order.chunk_by(|a, b| a.0 == b.0).map(of_class).collect() }
+    }
+
+    /// Returns the winding number around a place that is on no triangle: 1 inside of a closed surface that faces outward, 0
+    /// outside, and between them near holes.
+    pub(crate) fn around(&self, place_m: DVec3) -> f64 {
+        let mut waiting = Vec::new();
+        self.sizes.iter().map(|size| size.angle(place_m, &mut waiting)).sum::<f64>() / (4.0 * PI)
     }
 }
 
