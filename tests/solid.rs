@@ -16,7 +16,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::{Body, CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
+use palpate_tissue::scene::{self, Body, CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
 
 /// A block of 60 × 60 × 30 mm that is held below, of a tissue of 8 kPa.
@@ -324,6 +324,19 @@ fn an_indentation_goes_in_and_comes_back_on_one_curve() {
     // The truth is 107.37 N/m, and cubes of 6 mm are a tenth too stiff.
     assert!((105.0..130.0).contains(&indented.stiffness_n_per_m), "{}", indented.stiffness_n_per_m);
     assert!(indented.summary.mesh_error_estimate.is_some_and(|error| error > 0.05 && error < 0.3));
+    assert_eq!(indented.gives_way_at_m(), None);
+}
+
+/// Under an even pressure of more than E, nothing is in equilibrium near the shape at rest.
+#[test]
+fn a_deep_indentation_tells_where_the_tissue_gives_way() {
+    let text = scene::BUILT_IN.iter().find(|(name, _)| *name == "phantom").unwrap().1;
+    let scene = Scene::parse("phantom", text, &[], &Limits::default()).unwrap();
+    let model = Model::compile(&scene, &Limits::default()).unwrap();
+    let deep = Indentation { place_m: None, radius_m: 0.005, depth_m: 6e-3, speed_m_per_s: 0.02 };
+    let deep = deep.run(&model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();
+    let gives_way_at_m = deep.gives_way_at_m().unwrap();
+    assert!((4e-3..6.1e-3).contains(&gives_way_at_m), "{:?}", deep.curve);
 }
 
 /// Doubled and turned triangles, triangles on an edge of two others, and a second block that crosses the first.

@@ -100,6 +100,13 @@ pub(crate) fn run(
     for warning in &indented.summary.warnings {
         say!("palpate: warning: {warning}");
     }
+    if let Some(depth_m) = indented.gives_way_at_m() {
+        say!(
+            "palpate: warning: the tissue gives way at a depth of {:.2} mm, where the force falls: an even pressure presses it no \
+             deeper without a jump. Use a larger --radius-mm, or a smaller --depth-mm",
+            1e3 * depth_m
+        );
+    }
     if let Some(path) = output {
         write_file(path, csv(&indented).as_bytes())?;
     }

@@ -63,6 +63,22 @@ pub struct Indented {
     pub summary: Summary,
 }
 
+/// The force of a tip that goes in falls by this part of its largest where the tissue gives way.
+const GIVES_WAY: f64 = 0.02;
+
+impl Indented {
+    /// Returns the depth at which the tissue gives way, m: the first at which the force on the way in has fallen. Under an even
+    /// pressure a solid has no equilibrium from there on, until it has found another shape.
+    pub fn gives_way_at_m(&self) -> Option<f64> {
+        let mut largest_n = 0.0_f64;
+        let fallen = self.curve.iter().find(|row| {
+            largest_n = largest_n.max(row.loading_n);
+            row.loading_n < (1.0 - GIVES_WAY) * largest_n
+        });
+        fallen.map(|row| row.depth_m)
+    }
+}
+
 impl Indentation {
     /// Returns Young's modulus of the half space that would be as stiff under a disc of even pressure,
     /// E = 16·(1 − ν²)·k/(3π²·a) with k = F/ū (Timoshenko and Goodier, Theory of Elasticity, section 139), Pa.

@@ -45,8 +45,7 @@ use spot::Spot;
 /// Arguments of `link`.
 #[derive(Args)]
 pub(crate) struct LinkArguments {
-    /// A scene file, or the name of a scene in ./scenes or built in (colon, fibrotic, gallbladder, liver,
-    /// liver-organ, paper, stomach)
+    /// A scene file, or the name of one that is in ./scenes or built in: `liver`, `liver-organ`, `prostate`, …
     #[arg(long, default_value = "liver")]
     scene: PathBuf,
     /// The hand that holds the device: light, medium or firm; or none: a weak string leads the device
