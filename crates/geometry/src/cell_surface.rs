@@ -9,6 +9,10 @@ use crate::fill::Lattice;
 use crate::manifold_grid::fill_ambiguous;
 use crate::work::spend;
 
+/// A cube whose part is nearer to one half than this counts as filled by so much more than one half: vertices around the middle of
+/// one that is filled by exactly one half would be at the same place.
+const NEAREST: f32 = 0.01;
+
 /// Returns the surface at which `parts`, the filled part of each cube ([`Lattice::index`]), is one half between the middles
 /// of neighbouring cubes (surface nets). Cubes beyond the lattice are empty. The surface is closed and faces outward; it is
 /// empty if no cube is filled by more than half. What is thinner than a cube may be missing.
@@ -26,7 +30,8 @@ pub fn surface_of(parts: &[f32], lattice: &Lattice) -> TriangleMesh {
         for j in 0..lattice.cells[1] {
             for i in 0..lattice.cells[0] {
                 let at = ((k + 1) * points[1] + j + 1) * points[0] + i + 1;
-                distances[at] = 0.5 - parts[lattice.index([i, j, k])];
+                let distance = 0.5 - parts[lattice.index([i, j, k])];
+                distances[at] = if distance.abs() < NEAREST { -NEAREST } else { distance };
             }
         }
     }
@@ -60,6 +65,22 @@ mod tests {
         assert!(found.refusal().is_none() && found.holes == 0, "{found:?}");
         let ratio = found.volume_m3.unwrap() / truth.volume_m3.unwrap();
         assert!((ratio - 1.0).abs() < 0.02, "{ratio}");
+    }
+
+    #[test]
+    fn a_cube_that_is_filled_by_one_half_makes_no_edge_without_length() {
+        let lattice = Lattice { origin_m: DVec3::ZERO, edge_m: 1.0, cells: [3, 3, 3] };
+        for others in [0.0, 1.0] {
+            let mut parts = [others; 27];
+            parts[13] = 0.5;
+            let surface = surface_of(&parts, &lattice);
+            let edges = surface.triangles.iter().flat_map(|[a, b, c]| [[*a, *b], [*b, *c], [*c, *a]]);
+            let shortest = edges
+                .map(|ends| ends.map(|end| surface.vertices_m[end as usize]))
+                .map(|[a, b]| a.distance(b))
+                .min_by(f64::total_cmp);
+            assert!(shortest.is_some_and(|length| length > 1e-3), "{others}: {shortest:?}");
+        }
     }
 
     #[test]

@@ -18,9 +18,12 @@ use palpate_refusal::{Reason, Refusal, Result, legible};
 /// The number of a corner of the lattice that is no point.
 const NO_POINT: u32 = u32::MAX;
 
-/// Largest part of the rays that may run through holes of the surface. (Parts of a surface that touch in an edge make
-/// some.)
-const MAX_OPEN: f64 = 0.002;
+/// Largest part of the rays that may run through holes of the surface. The winding number closes smaller ones, and many triangles
+/// that are turned or doubled look like some.
+const MAX_OPEN: f64 = 0.02;
+
+/// From this part on they are told. (Parts of a surface that touch in an edge make some.)
+const TOLD_OPEN: f64 = 0.002;
 
 /// Vertices of the surface that tools touch: its edges are split until they are as long as those of a cube, or until there
 /// are as many.
@@ -95,14 +98,16 @@ impl SolidShape {
         }
         let lattice = lattice_around(extent, edge_m, fixed);
         let found = filled(&mesh.vertices_m, &mesh.triangles, &lattice);
-        if found.open_part > MAX_OPEN {
+        if found.open_part > TOLD_OPEN {
             let [x, y, z] = found.open_at_m.unwrap_or_default().to_array().map(legible);
             let message = format!(
-                "is not closed: {:.1} % of the lines across it pass through a hole, one at ({x}, {y}, {z}) m; \
-                 `palpate mesh FILE --repair` may close it",
+                "is not closed: {:.1} % of the lines across it pass through a hole, one at ({x}, {y}, {z}) m",
                 100.0 * found.open_part
             );
-            return Err(refuse(message));
+            if found.open_part > MAX_OPEN {
+                return Err(refuse(message + "; `palpate mesh FILE --repair` may close it"));
+            }
+            findings.push(format!("mesh: {message}; cells fill it as if the hole were closed"));
         }
         if found.parts.iter().all(|part| *part == 0.0) {
             return Err(refuse("encloses nothing".to_owned()));
