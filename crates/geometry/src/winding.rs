@@ -129,6 +129,11 @@ fn solid_angle(corners: &[DVec3; 3], place_m: DVec3) -> f64 {
 mod tests {
     use super::*;
     use crate::organ::{Organ, generate};
+    use crate::work::within;
+    use std::sync::Arc;
+
+    /// Most nodes that a place may look at on the average.
+    const MOST: u64 = 600;
 
     #[test]
     fn a_place_inside_has_1_and_one_outside_0() {
@@ -146,5 +151,19 @@ mod tests {
         mesh.triangles.iter_mut().step_by(20).for_each(|triangle| triangle.swap(0, 1));
         let found = Winding::new(&mesh.vertices_m, &mesh.triangles).around(DVec3::ZERO);
         assert!((found - 0.9).abs() < 0.05, "{found}");
+    }
+
+    #[test]
+    fn a_few_long_triangles_make_no_place_look_at_all_short_ones() {
+        let mut mesh = generate(Organ::Kidney, 2e-3, 1).unwrap();
+        let count = u32::try_from(mesh.vertices_m.len()).unwrap();
+        for first in (0..count / 3).step_by(40) {
+            let corners = [first, first + count / 3, first + 2 * (count / 3)];
+            mesh.triangles.extend([corners, [corners[1], corners[0], corners[2]]]);
+        }
+        let winding = Winding::new(&mesh.vertices_m, &mesh.triangles);
+        let places = (0..100).map(|n| DVec3::new(0.02, 0.0, 2e-4 * f64::from(n)));
+        let found = within(&Arc::default(), 100 * MOST, || places.map(|place_m| winding.around(place_m)).count());
+        assert_eq!(found, Ok(100));
     }
 }
