@@ -58,8 +58,8 @@ impl FarArea {
 }
 
 impl SizeClass {
-    fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]], of: &[u32]) -> Self {
-        let tree = Tree::new(vertices_m, triangles, of.iter().copied());
+    fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]], of: impl Iterator<Item = u32>) -> Self {
+        let tree = Tree::new(vertices_m, triangles, of);
         let of = |triangle: &u32| corners(vertices_m, triangles[*triangle as usize]);
         let triangles_m: Vec<[DVec3; 3]> = tree.order().iter().map(of).collect();
         let areas = (0..tree.len()).map(|node| FarArea::of(&triangles_m[tree.range(node)])).collect();
@@ -100,10 +100,8 @@ impl Winding {
         let mut order: Vec<(i32, u32)> =
             (0..).take(triangles.len()).map(|triangle| (class(triangle), triangle)).collect();
         order.sort_unstable();
-        let of_class = |all: &[(i32, u32)]| {
-            let of: Vec<u32> = all.iter().map(|(_, triangle)| *triangle).collect();
-            SizeClass::new(vertices_m, triangles, &of)
-        };
+        let of_class =
+            |all: &[(i32, u32)]| SizeClass::new(vertices_m, triangles, all.iter().map(|(_, triangle)| *triangle));
         Winding { sizes: order.chunk_by(|a, b| a.0 == b.0).map(of_class).collect() }
     }
 
