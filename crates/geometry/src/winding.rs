@@ -161,7 +161,7 @@ mod tests {
         }
         let winding = Winding::new(&mesh.vertices_m, &mesh.triangles);
         let places = (0..100).map(|n| DVec3::new(0.02, 0.0, 2e-4 * f64::from(n)));
-        let found = within(&Arc::default(), 100 * MOST, || places.map(|place_m| winding.around(place_m)).count());
-        assert_eq!(found, Ok(100));
+        let found = within(&Arc::default(), 100 * MOST, || places.map(|place_m| winding.around(place_m)).sum::<f64>());
+        assert!(found.is_ok_and(f64::is_finite), "{found:?}");
     }
 }
