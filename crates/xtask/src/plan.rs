@@ -141,21 +141,31 @@ impl System {
 
     fn test(&self, asked: &[TestPart]) -> Result<Vec<PlanStage>, TaskFailure> {
         let is_asked = |part: TestPart| asked.is_empty() || asked.contains(&part);
-        let mut stages = Vec::new();
+        // What is fetched and built for Python and the page waits for the network and for one core: it is made while Cargo
+        // compiles.
+        let mut built = Vec::new();
         if [TestPart::Viewer, TestPart::Python, TestPart::Rust, TestPart::Abi, TestPart::Documents]
             .into_iter()
             .any(is_asked)
         {
-            stages.push(PlanStage::Step(self.cargo(&["build", "--release", "--workspace"])));
+            built.push(self.cargo(&["build", "--release", "--workspace"]));
         }
-        if [TestPart::Python, TestPart::Documents].into_iter().any(is_asked) {
+        let needs_python = [TestPart::Python, TestPart::Documents].into_iter().any(is_asked);
+        if needs_python {
             self.need_python()?;
-            stages.extend(self.venv());
+            built.extend(self.venv());
         }
         if is_asked(TestPart::Viewer) {
             self.need_node()?;
+            built.extend(self.page());
+        }
+        let mut stages: Vec<PlanStage> = beside(built).into_iter().collect();
+        if needs_python && !self.has_venv {
+            stages.push(PlanStage::Mark(VENV_READY));
+        }
+        if is_asked(TestPart::Viewer) {
             let tests = ["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"]));
-            stages.extend(self.page().into_iter().chain(tests).map(PlanStage::Step));
+            stages.extend(tests.map(PlanStage::Step));
         }
         // These wait for most of their time, so that they run at once.
         let mut waiting = Vec::new();
@@ -207,16 +217,13 @@ impl System {
         self.venv_python(&[&own[..], arguments].concat())
     }
 
-    fn venv(&self) -> Vec<PlanStage> {
+    /// Returns what makes the environment for Python; nothing if it is there.
+    fn venv(&self) -> Vec<Step> {
         if self.has_venv {
             return Vec::new();
         }
         let install = self.pip(&["-r", REQUIREMENTS[0], "-r", REQUIREMENTS[1]]);
-        vec![
-            PlanStage::Step(step(&self.python, &["-m", "venv", "target/venv"])),
-            PlanStage::Step(install),
-            PlanStage::Mark(VENV_READY),
-        ]
+        vec![step(&self.python, &["-m", "venv", "target/venv"]), install]
     }
 
     fn unittest(&self, folder: &str) -> Step {
@@ -227,10 +234,10 @@ impl System {
         self.need_python()?;
         self.need_node()?;
         let clippy = ["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"];
-        let steps =
-            [self.cargo(&["fmt", "--all", "--check"]), step(&self.python, &["tests/counts.py"]), self.cargo(&clippy)];
+        let steps = [self.cargo(&["fmt", "--all", "--check"]), step(&self.python, &["tests/counts.py"])];
         let pages = ["clients/typescript", "clients/viewer"].map(|of| self.npm(of, &["run", "lint"]));
-        Ok(steps.into_iter().chain(self.modules()).chain(pages).map(PlanStage::Step).collect())
+        let checks = [self.cargo(&clippy)].into_iter().chain(self.modules()).chain(pages).collect();
+        Ok(steps.into_iter().map(PlanStage::Step).chain(beside(checks)).collect())
     }
 }
 
@@ -394,7 +401,7 @@ mod tests {
     #[test]
     fn the_python_environment_is_made_once() {
         let first = lines(&ProjectTask::Test(vec![TestPart::Documents]), &machine(true));
-        assert_eq!(first[1], "python -m venv target/venv");
+        assert_eq!(first[1], "python -m venv target/venv   # at the same time");
         assert!(first[2].starts_with("target/venv/Scripts/python.exe -m pip install"), "{first:?}");
         assert_eq!(first[3], "# marks target/venv/ready");
         assert_eq!(lines(&ProjectTask::Test(vec![TestPart::Documents]), &built(true)).len(), 2);
@@ -405,8 +412,9 @@ mod tests {
         let lint = lines(&ProjectTask::Lint, &machine(false));
         assert_eq!(lint[1], "python3 tests/counts.py");
         assert_eq!(lint[2], "cargo clippy --release --workspace --all-targets -- -D warnings");
-        let install = lint.iter().position(|line| line == "(in clients) npm ci").unwrap();
-        assert!(lint[install + 1..].iter().all(|line| line.ends_with("npm run lint")) && lint.len() == install + 3);
+        let [install, typescript, viewer] = &lint[3..] else { panic!("{lint:?}") };
+        assert_eq!(install, "(in clients) npm ci   # at the same time");
+        assert!([typescript, viewer].iter().all(|line| line.ends_with("npm run lint   # at the same time")), "{lint:?}");
         assert_eq!(
             lines(&ProjectTask::Page, &machine(false)),
             ["(in clients) npm ci", "(in clients/viewer) npm run build"]
