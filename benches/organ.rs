@@ -8,7 +8,7 @@ mod report;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip, TipShape};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::tangent;
 use palpate_tissue::scene::profile::Poke;
@@ -22,7 +22,8 @@ use serde_json::json;
 /// Steps of one timing.
 const STEPS: usize = 20;
 
-const TIP: Tip = Tip { radius_m: 0.005, friction: 0.0, grasps: false, coupling: Coupling::Constraint };
+const TIP: Tip =
+    Tip { shape: TipShape::Disc, radius_m: 0.005, friction: 0.0, grasps: false, coupling: Coupling::Constraint };
 
 fn model(name: &str, sets: &[String]) -> Arc<Model> {
     let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;

@@ -211,7 +211,8 @@ fn touch(session: &mut Session, model: &Arc<Model>, dice: &mut Rng, limits: &Lim
         _ => Coupling::Constraint,
     };
     let radius_m = number(dice, edge_m, 0.1);
-    let tip = Tip { radius_m, friction: number(dice, 0.3, 0.1), grasps: dice.u8(0..6) == 0, coupling };
+    let (friction, grasps) = (number(dice, 0.3, 0.1), dice.u8(0..6) == 0);
+    let tip = Tip { radius_m, friction, grasps, coupling, ..Tip::default() };
     let place_m = rest_m - number(dice, 0.1 * edge_m, 0.1) * normal;
     let pose = Action::Pose { place_m, velocity_m_per_s: None, tip };
     let mut intake = Intake::new(&model.scene, limits).continued(session, None);

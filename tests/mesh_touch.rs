@@ -111,7 +111,13 @@ fn sphere(times: u32, radius_m: f64) -> (MeshShape, f64) {
     (MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap(), area_m2)
 }
 
-const TIP: Tip = Tip { radius_m: 0.005, friction: 0.0, grasps: false, coupling: palpate_haptics::Coupling::Constraint };
+const TIP: Tip = Tip {
+    shape: palpate_haptics::TipShape::Disc,
+    radius_m: 0.005,
+    friction: 0.0,
+    grasps: false,
+    coupling: palpate_haptics::Coupling::Constraint,
+};
 
 /// Moves a tool straight from one place to another in so many steps, and leaves it there for `rest` more.
 fn lead(tissue: &mut dyn Tissue, from_m: DVec3, to_m: DVec3, steps: u32, rest: u32, tip: Tip) -> ToolContact {

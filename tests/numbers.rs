@@ -269,6 +269,7 @@ fn commands() -> Vec<pb::Command> {
             friction: Some(0.3),
             grasps: false,
             spring: Some(pb::Spring { stiffness_n_per_m: 200.0, damping_n_s_per_m: 0.5 }),
+            ..Default::default()
         }),
         velocity_m_per_s: vector(0.01, 0.0, -0.1),
     };

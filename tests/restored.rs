@@ -143,6 +143,7 @@ fn tip(scene: &Scene, random: &mut Rng) -> Tip {
         friction: [0.0, 0.2, 10.0][random.usize(0..3)],
         grasps: random.u8(0..3) == 0,
         coupling: if random.u8(0..3) == 0 { spring } else { Coupling::Constraint },
+        ..Tip::default()
     }
 }
 

@@ -9,12 +9,13 @@ use std::sync::atomic::AtomicBool;
 
 use glam::DVec3;
 use palpate_geometry::ReadLimits;
-use palpate_haptics::Tip;
+use palpate_haptics::{ContactState, Tip, TipShape};
 use palpate_refusal::Reason;
 use palpate_session::indentation::Indentation;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
+use palpate_tissue::saved::PlainTissue;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::{self, Body, CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
@@ -309,10 +310,13 @@ fn the_error_of_the_cubes_is_estimated_within_a_factor_of_two() {
     );
 }
 
+const INDENTATION: Indentation =
+    Indentation { place_m: None, shape: TipShape::Disc, radius_m: 0.005, depth_m: 1e-3, speed_m_per_s: 0.002 };
+
 #[test]
 fn an_indentation_goes_in_and_comes_back_on_one_curve() {
     let model = block("cell_m = 0.006", &["material.damping_per_s=20"]);
-    let indentation = Indentation { place_m: None, radius_m: 0.005, depth_m: 1e-3, speed_m_per_s: 0.002 };
+    let indentation = INDENTATION;
     let indented = indentation.run(&model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();
     let [first, .., last] = &indented.curve[..] else { panic!() };
     assert!(indented.curve.len() == 21 && first.depth_m == 0.0 && (last.depth_m - 1e-3).abs() < 1e-6, "{last:?}");
@@ -333,10 +337,144 @@ fn a_deep_indentation_tells_where_the_tissue_gives_way() {
     let text = scene::BUILT_IN.iter().find(|(name, _)| *name == "phantom").unwrap().1;
     let scene = Scene::parse("phantom", text, &[], &Limits::default()).unwrap();
     let model = Model::compile(&scene, &Limits::default()).unwrap();
-    let deep = Indentation { place_m: None, radius_m: 0.005, depth_m: 6e-3, speed_m_per_s: 0.02 };
+    let deep = Indentation { depth_m: 6e-3, speed_m_per_s: 0.02, ..INDENTATION };
     let deep = deep.run(&model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();
     let gives_way_at_m = deep.gives_way_at_m().unwrap();
     assert!((4e-3..6.1e-3).contains(&gives_way_at_m), "{:?}", deep.curve);
+}
+
+/// Returns the mean of the forces on the way in and back at the last depth but `rows` of an indentation, N, and that depth, m.
+fn indented_n(model: &Arc<Model>, indentation: Indentation) -> (f64, f64) {
+    let indented = indentation.run(model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();
+    assert!(indented.summary.fault().is_none(), "{indentation:?}: {:?}", indented.summary);
+    let row = indented.curve[10];
+    (0.5 * (row.loading_n + row.unloading_n), row.depth_m)
+}
+
+/// On a half space a rigid disc is 32/(3π²) = 1.081 times as stiff as an even pressure (Boussinesq), of which the block has
+/// 107.37 N/m. For a sphere: Hertz, whose force at a depth is that of the block for the depth less what an even pressure of the
+/// same force spares by the block's finite size.
+#[test]
+fn rigid_tips_meet_the_stiffness_that_theory_gives_wherever_the_cells_are() {
+    let even_n_per_m: f64 = 107.37;
+    let modulus_pa = 8e3 / (1.0 - 0.45_f64.powi(2));
+    let half_space_n_per_m = 3.0 * std::f64::consts::PI.powi(2) / 16.0 * 0.005 * modulus_pa;
+    let spared_m_per_n = half_space_n_per_m.recip() - even_n_per_m.recip();
+    let hertz_n = |radius_m: f64, depth_m: f64| {
+        let of_depth = |depth_m: f64| 4.0 / 3.0 * modulus_pa * radius_m.sqrt() * depth_m.powf(1.5);
+        (0..50).fold(of_depth(depth_m), |force_n, _| of_depth(depth_m + spared_m_per_n * force_n))
+    };
+    let places = [DVec3::ZERO, 0.5 * DVec3::X, DVec3::new(0.5, 0.5, 0.0)];
+    for (cell_m, places) in [(0.005, &places[..]), (0.003, &places[..1])] {
+        let model = block(&format!("cell_m = {cell_m}"), &["material.damping_per_s=60"]);
+        for along in places.iter().copied() {
+            let place_m = Some(DVec3::new(0.03, 0.03, 0.03) + cell_m * along);
+            let base = Indentation { place_m, speed_m_per_s: 0.01, ..INDENTATION };
+            let (disc_n, depth_m) =
+                indented_n(&model, Indentation { shape: TipShape::RigidDisc, depth_m: 4e-4, ..base });
+            let disc = disc_n / depth_m / (32.0 / (3.0 * std::f64::consts::PI.powi(2)) * even_n_per_m);
+            let sphere = Indentation { shape: TipShape::Sphere, radius_m: 0.01, depth_m: 4e-3, ..base };
+            let (sphere_n, depth_m) = indented_n(&model, sphere);
+            let sphere = sphere_n / hertz_n(0.01, depth_m);
+            println!("{cell_m} {along}: {disc:.3} {sphere:.3}");
+            assert!(
+                (0.93..1.07).contains(&disc) && (0.85..1.15).contains(&sphere),
+                "{cell_m} {along}: {disc} {sphere}"
+            );
+        }
+    }
+}
+
+/// To two fifths of the thickness. An even pressure gives way before one radius
+/// ([`a_deep_indentation_tells_where_the_tissue_gives_way`]).
+#[test]
+fn rigid_tips_press_deep_with_a_force_that_rises_and_give_no_more_back_than_they_take() {
+    let model = block("cell_m = 0.005", &["material.damping_per_s=60"]);
+    for shape in [TipShape::RigidDisc, TipShape::Sphere] {
+        let deep = Indentation { shape, radius_m: 0.01, depth_m: 0.012, speed_m_per_s: 0.03, ..INDENTATION };
+        let indented = deep.run(&model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();
+        let most_n = indented.curve.last().unwrap().loading_n;
+        println!("{shape:?}: {:.3?}", indented.curve.iter().map(|row| row.loading_n).collect::<Vec<_>>());
+        println!("{shape:?}: {:.3?}", indented.curve.iter().map(|row| row.unloading_n).collect::<Vec<_>>());
+        assert!(indented.summary.fault().is_none(), "{shape:?}: {:?}", indented.summary);
+        assert!(indented.curve.is_sorted_by(|a, b| a.loading_n < b.loading_n), "{shape:?}: {:?}", indented.curve);
+        assert!(
+            indented.curve.iter().all(|row| row.unloading_n < row.loading_n + 0.01 * most_n),
+            "{:?}",
+            indented.curve
+        );
+    }
+}
+
+/// Presses a rigid tip 2 mm deep and moves it over the block. `at` gets the tissue after each step.
+fn stroked(tissue: &mut dyn Tissue, tip: Tip, steps: std::ops::Range<u32>, at: &mut dyn FnMut(&dyn Tissue)) {
+    for step in steps {
+        let part = |from: u32, over: f64| (f64::from(step.saturating_sub(from)) / over).min(1.0);
+        let down_m = 2e-3 * part(0, 200.0);
+        let place_m =
+            DVec3::new(0.025 + 0.01 * part(300, 300.0), 0.031, 0.03 - down_m + tip.shape.height_m(tip.radius_m));
+        tissue.pose(0, place_m, tip);
+        tissue.step().unwrap();
+        at(tissue);
+    }
+}
+
+#[test]
+fn friction_holds_a_rigid_tip_up_to_its_part_of_the_pressure() {
+    for shape in [TipShape::RigidDisc, TipShape::Sphere] {
+        for friction in [0.0, 0.3] {
+            let tip = Tip { shape, friction, ..Tip::default() };
+            let mut tissue = at_rest(&block("cell_m = 0.005", &[]));
+            let mut contact = None;
+            stroked(&mut *tissue, tip, 0..600, &mut |tissue| contact = tissue.tool_contact(0));
+            let contact = contact.unwrap();
+            let force_n = contact.force_on_tool_n;
+            assert_eq!((contact.contact_state, tissue.guard_events()), (ContactState::Sliding, 0), "{tip:?}");
+            let ratio = -force_n.x / force_n.z;
+            println!("{shape:?} {friction}: {force_n}");
+            // The tissue in front of a tip rises, which holds it too.
+            let least = if friction == 0.0 { -0.02 } else { 0.8 * friction };
+            assert!((least..friction + 0.2).contains(&ratio), "{tip:?}: {force_n}");
+        }
+    }
+}
+
+#[test]
+fn a_rigid_tip_continues_from_a_snapshot_with_the_same_bits() {
+    for shape in [TipShape::RigidDisc, TipShape::Sphere] {
+        let tip = Tip { shape, ..Tip::default() };
+        let model = block("cell_m = 0.005", &["stepping.integrator=\"exponential4\""]);
+        let mut tissue = at_rest(&model);
+        stroked(&mut *tissue, tip, 0..400, &mut |_| {});
+        let PlainTissue { parts, values } = tissue.save().plain();
+        let mut continued = palpate_tissue::restored(&model, &parts, &values, &Limits::default()).unwrap();
+        for tissue in [&mut tissue, &mut continued] {
+            stroked(&mut **tissue, tip, 400..500, &mut |_| {});
+        }
+        assert!(tissue.tool_contact(0).unwrap().force_on_tool_n.z > 0.01);
+        assert_eq!(tissue.state_hash(), continued.state_hash(), "{shape:?}");
+        assert_eq!(tissue.tool_contact(0), continued.tool_contact(0), "{shape:?}");
+    }
+}
+
+#[test]
+fn rigid_tips_that_nothing_can_be_are_refused() {
+    let refused = |scene: &Scene, tip: &str| {
+        let text = format!(
+            "name = \"a\"\nduration_s = 1\nsample_every_s = 0.1\n[[tool]]\ntip = {{ {tip} }}\nposes = [{{ at_s = 0, place_m = [0.03, 0.03, 0.03] }}]"
+        );
+        let read = palpate_tissue::scene::script::Script::parse("a", &text, Path::new(""), scene, &Limits::default());
+        read.err().map(|refusal| refusal.field)
+    };
+    let solid = small("", &[]);
+    assert_eq!(refused(&solid.scene, "shape = \"sphere\""), None);
+    let of = |name: &str| Some(format!("tool[0].tip.{name}"));
+    assert_eq!(refused(&solid.scene, "shape = \"cube\""), of("shape"));
+    assert_eq!(refused(&solid.scene, "shape = \"sphere\", grasps = true"), of("shape"));
+    let spring = "shape = \"rigid\", spring = { stiffness_n_per_m = 1, damping_n_s_per_m = 0 }";
+    assert_eq!(refused(&solid.scene, spring), of("shape"));
+    let sheet = read(palpate_tissue::scene::PAPER, &[]).unwrap();
+    assert_eq!(refused(&sheet, "shape = \"sphere\""), of("shape"));
 }
 
 /// Doubled and turned triangles, triangles on an edge of two others, and a second block that crosses the first.

@@ -14,7 +14,7 @@ mod random_scenes;
 
 use common::{SMALL, model, scene_with};
 use glam::DVec3;
-use palpate_haptics::Tip;
+use palpate_haptics::{Tip, TipShape};
 use palpate_tissue::guard::INTERVAL_SUBSTEPS;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
@@ -308,11 +308,9 @@ fn abused(seed: u64) -> Option<[u64; 2]> {
                 1 | 2 => {
                     // From the surface to a fifth of the height.
                     let at = DVec3::new(0.4, 0.4, 0.5 - 0.8 * dice.f64()) * side * size_m;
-                    tissue.pose(
-                        tool,
-                        middle_m + at,
-                        Tip { radius_m: cell_m * (0.5 + 2.0 * dice.f64()), ..Tip::default() },
-                    );
+                    let shape = TipShape::ALL[dice.usize(0..3)];
+                    let radius_m = cell_m * (0.5 + 2.0 * dice.f64());
+                    tissue.pose(tool, middle_m + at, Tip { shape, radius_m, ..Tip::default() });
                 }
                 3 => {
                     let point = palpate_tissue::shape::PointId::new(dice.usize(0..shape.point_count()));

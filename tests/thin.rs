@@ -62,7 +62,7 @@ fn tip(dice: &mut fastrand::Rng) -> Tip {
     };
     let radius_m = 10_f64.powf(-3.3 + 1.3 * dice.f64());
     let friction = [0.0, 0.2, 0.8][dice.usize(0..3)];
-    Tip { radius_m, friction, grasps: dice.u8(0..6) == 0, coupling }
+    Tip { radius_m, friction, grasps: dice.u8(0..6) == 0, coupling, ..Tip::default() }
 }
 
 fn energy_j(tissue: &dyn Tissue) -> f64 {

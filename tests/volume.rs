@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use common::{model, scene_with, schemes};
 use glam::DVec3;
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip, TipShape};
 use palpate_refusal::Reason;
 use palpate_session::run::{RunOptions, run};
 use palpate_tissue::limits::Limits;
@@ -126,7 +126,8 @@ fn what_nothing_damps_keeps_its_energy_and_what_nothing_holds_its_momentum() {
     }
 }
 
-const TIP: Tip = Tip { radius_m: 0.02, friction: 0.2, grasps: false, coupling: Coupling::Constraint };
+const TIP: Tip =
+    Tip { shape: TipShape::Disc, radius_m: 0.02, friction: 0.2, grasps: false, coupling: Coupling::Constraint };
 
 /// The same pressed in from above, by 10 % of its size, until all is steady.
 fn pressed(stiffness_pa: &str) -> Box<dyn Tissue> {

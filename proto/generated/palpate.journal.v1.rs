@@ -207,6 +207,9 @@ pub struct Tip {
     pub spring_n_per_m: ::core::option::Option<f64>,
     #[prost(double, tag = "5")]
     pub spring_n_s_per_m: f64,
+    /// 0 an even disc, 1 a rigid disc, 2 a sphere.
+    #[prost(uint32, tag = "6")]
+    pub shape: u32,
 }
 impl ::prost::Name for Tip {
     const NAME: &'static str = "Tip";

@@ -335,7 +335,7 @@ impl ::prost::Name for Pose {
 /// The tip of a tool, with which it meets the tissue.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Tip {
-    /// Radius of the disc, m. A stiffness in N/m depends on it.
+    /// Radius of the disc or sphere, m. A stiffness in N/m depends on it.
     #[prost(double, tag = "1")]
     pub radius_m: f64,
     /// μ of Coulomb's friction, 0 to 10. Absent: 0.2.
@@ -344,9 +344,12 @@ pub struct Tip {
     /// Whether it holds the tissue, and pulls as well as pushes; else it touches, and only pushes.
     #[prost(bool, tag = "3")]
     pub grasps: bool,
-    /// Couples the tool by a spring; absent: the surface follows the tool exactly.
+    /// Couples the tool by a spring; absent: the surface follows the tool exactly. Not for a rigid shape.
     #[prost(message, optional, tag = "4")]
     pub spring: ::core::option::Option<Spring>,
+    /// A rigid shape touches and does not grasp.
+    #[prost(enumeration = "TipShape", tag = "5")]
+    pub shape: i32,
 }
 impl ::prost::Name for Tip {
     const NAME: &'static str = "Tip";
@@ -1495,6 +1498,43 @@ impl ::prost::Name for Energy {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Energy".into()
+    }
+}
+/// The body with which a tool meets the tissue.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum TipShape {
+    /// As TIP_SHAPE_DISC.
+    Unspecified = 0,
+    /// A disc that presses with an even pressure and lies on the surface. The tool's place is the mean of the surface over it.
+    Disc = 1,
+    /// A flat rigid disc that keeps the direction in which it met the tissue. The tool's place is its middle. Solids only.
+    RigidDisc = 2,
+    /// A rigid sphere. The tool's place is its centre. Solids only.
+    Sphere = 3,
+}
+impl TipShape {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "TIP_SHAPE_UNSPECIFIED",
+            Self::Disc => "TIP_SHAPE_DISC",
+            Self::RigidDisc => "TIP_SHAPE_RIGID_DISC",
+            Self::Sphere => "TIP_SHAPE_SPHERE",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "TIP_SHAPE_UNSPECIFIED" => Some(Self::Unspecified),
+            "TIP_SHAPE_DISC" => Some(Self::Disc),
+            "TIP_SHAPE_RIGID_DISC" => Some(Self::RigidDisc),
+            "TIP_SHAPE_SPHERE" => Some(Self::Sphere),
+            _ => None,
+        }
     }
 }
 /// The contact of a tool with the tissue.

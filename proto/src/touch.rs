@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 use palpate_haptics::force_law::{Law, Row};
-use palpate_haptics::{ContactState, Coupling, Device, LocalModel, Tip};
+use palpate_haptics::{ContactState, Coupling, Device, LocalModel, Tip, TipShape};
 
 use crate::geometry::{from_vector, point, vector};
 use crate::pb;
@@ -42,9 +42,15 @@ pub fn device(device: &Device) -> pb::Device {
 }
 
 /// Returns the tip in a message; the default tip if it is absent, with the default friction if that is absent.
-/// Couples it by a spring if the message has one, otherwise by a constraint. Does not check the values.
+/// Couples it by a spring if the message has one, otherwise by a constraint. An unknown shape is a disc. Does not check
+/// the values.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
+        shape: match tip.shape() {
+            pb::TipShape::Unspecified | pb::TipShape::Disc => TipShape::Disc,
+            pb::TipShape::RigidDisc => TipShape::RigidDisc,
+            pb::TipShape::Sphere => TipShape::Sphere,
+        },
         radius_m: tip.radius_m,
         friction: tip.friction.unwrap_or(Tip::default().friction),
         grasps: tip.grasps,
@@ -57,7 +63,13 @@ pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
 
 /// Converts a tip to a message; [`from_tip`] returns an equal tip.
 pub fn tip(tip: &Tip) -> pb::Tip {
+    let shape = match tip.shape {
+        TipShape::Disc => pb::TipShape::Unspecified,
+        TipShape::RigidDisc => pb::TipShape::RigidDisc,
+        TipShape::Sphere => pb::TipShape::Sphere,
+    };
     pb::Tip {
+        shape: shape.into(),
         radius_m: tip.radius_m,
         friction: Some(tip.friction),
         grasps: tip.grasps,

@@ -6,6 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_haptics::TipShape;
 use palpate_refusal::{Reason, Refusal, positive};
 use palpate_session::indentation::{Indentation, Indented};
 use palpate_tissue::Model;
@@ -30,10 +31,13 @@ pub(crate) struct IndentArguments {
     /// sheet, the top of a solid
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true)]
     place: Option<Vec<f64>>,
-    /// With `indent`: the radius of the tip, mm; it presses evenly on this disc. Default: 5, or less on a small tissue
+    /// With `indent`: the tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid. Default: disc
+    #[arg(long, value_name = "SHAPE")]
+    tip: Option<TipShape>,
+    /// With `indent`: the radius of the tip, mm. Default: 5, or less on a small tissue
     #[arg(long, value_name = "MM")]
     radius_mm: Option<f64>,
-    /// With `indent`: the largest depth, mm, the mean over the disc. Default: 0.4 of the radius
+    /// With `indent`: the largest depth, mm; of an even pressure it is the mean over the disc. Default: 0.4 of the radius
     #[arg(long, value_name = "MM")]
     depth_mm: Option<f64>,
     /// With `indent`: the speed of the tip, mm/s. Default: 2
@@ -49,6 +53,7 @@ impl IndentArguments {
     pub(crate) fn refuse_without_indent(&self) -> Result<(), Failure> {
         let given = [
             ("--place", self.place.is_some()),
+            ("--tip", self.tip.is_some()),
             ("--radius-mm", self.radius_mm.is_some()),
             ("--depth-mm", self.depth_mm.is_some()),
             ("--speed-mm-per-s", self.speed_mm_per_s.is_some()),
@@ -76,6 +81,7 @@ impl IndentArguments {
         let radius_m = in_m("--radius-mm", self.radius_mm, FINGERTIP_M.min(PART * size_m))?;
         Ok(Indentation {
             place_m,
+            shape: self.tip.unwrap_or_default(),
             radius_m,
             depth_m: in_m("--depth-mm", self.depth_mm, DEPTH * radius_m)?,
             speed_m_per_s: in_m("--speed-mm-per-s", self.speed_mm_per_s, 0.002)?,
@@ -102,8 +108,8 @@ pub(crate) fn run(
     }
     if let Some(depth_m) = indented.gives_way_at_m() {
         say!(
-            "palpate: warning: the tissue gives way at a depth of {:.2} mm, where the force falls: an even pressure presses it no \
-             deeper without a jump. Use a larger --radius-mm, or a smaller --depth-mm",
+            "palpate: warning: the tissue gives way at a depth of {:.2} mm, where the force falls: this tip presses it no deeper \
+             without a jump. Use --tip sphere, a larger --radius-mm, or a smaller --depth-mm",
             1e3 * depth_m
         );
     }
@@ -128,8 +134,13 @@ fn csv(indented: &Indented) -> String {
 fn text(indentation: &Indentation, indented: &Indented, model: &Model) -> String {
     let [x, y, z] = indented.place_m.to_array().map(|v| 1e3 * v);
     let (radius_mm, speed) = (1e3 * indentation.radius_m, 1e3 * indentation.speed_m_per_s);
+    let tip = match indentation.shape {
+        TipShape::Disc => "even pressure on a disc",
+        TipShape::RigidDisc => "rigid disc",
+        TipShape::Sphere => "rigid sphere",
+    };
     let mut text = format!(
-        "{} at ({x:.2}, {y:.2}, {z:.2}) mm, even pressure on a disc of radius {radius_mm:.3} mm, {speed:.3} mm/s\n\n\
+        "{} at ({x:.2}, {y:.2}, {z:.2}) mm, {tip} of radius {radius_mm:.3} mm, {speed:.3} mm/s\n\n\
          {:>9}  {:>12}  {:>12}\n",
         model.scene.name, "depth mm", "loading N", "unloading N"
     );
@@ -139,7 +150,9 @@ fn text(indentation: &Indentation, indented: &Indented, model: &Model) -> String
     let _ = writeln!(text, "\nstiffness of the first tenth  {:.3} N/m", indented.stiffness_n_per_m);
     if let Body::Solid(solid) = &model.scene.body {
         let nu = solid.material.poissons_ratio;
-        let apparent_pa = indentation.apparent_modulus_pa(indented.stiffness_n_per_m, nu);
+        // The first depths of a sphere are those of a few triangles.
+        let row = if indentation.shape == TipShape::Sphere { indented.curve.last() } else { indented.curve.get(2) };
+        let apparent_pa = row.map_or(0.0, |row| indentation.apparent_modulus_pa(row, nu));
         let own_pa = solid.material.youngs_modulus_pa;
         let _ = writeln!(
             text,

@@ -127,7 +127,8 @@ class Tissue:
         """Returns the row of the point that rests nearest to a place."""
 
 class Tip:
-    """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring."""
+    """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
+    `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only."""
 
     def __init__(
         self,
@@ -137,10 +138,14 @@ class Tip:
         grasps: bool = False,
         stiffness_n_per_m: Optional[float] = None,
         damping_n_s_per_m: float = 0.0,
+        shape: str = "disc",
     ) -> None: ...
     @property
+    def shape(self) -> str:
+        """The shape: disc, rigid or sphere."""
+    @property
     def radius_m(self) -> float:
-        """The radius of the disc, m."""
+        """The radius of the disc or sphere, m."""
     @property
     def friction(self) -> float:
         """The coefficient of friction."""

@@ -1,9 +1,11 @@
 //! The tip of a tool, for Python.
 
-use palpate_haptics::Coupling;
+use palpate_haptics::{Coupling, TipShape};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
-/// The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring.
+/// The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
+/// `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
@@ -11,16 +13,32 @@ pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
 #[pymethods]
 impl Tip {
     #[new]
-    #[pyo3(signature = (radius_m=0.005, *, friction=0.2, grasps=false, stiffness_n_per_m=None, damping_n_s_per_m=0.0))]
-    fn new(radius_m: f64, friction: f64, grasps: bool, stiffness_n_per_m: Option<f64>, damping_n_s_per_m: f64) -> Self {
+    #[pyo3(signature = (
+        radius_m=0.005, *, friction=0.2, grasps=false, stiffness_n_per_m=None, damping_n_s_per_m=0.0, shape="disc"
+    ))]
+    fn new(
+        radius_m: f64,
+        friction: f64,
+        grasps: bool,
+        stiffness_n_per_m: Option<f64>,
+        damping_n_s_per_m: f64,
+        shape: &str,
+    ) -> PyResult<Self> {
+        let shape: TipShape = shape.parse().map_err(|message| PyValueError::new_err(format!("shape: {message}")))?;
         let coupling = stiffness_n_per_m.map_or(Coupling::Constraint, |stiffness_n_per_m| Coupling::Spring {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        Tip(palpate_haptics::Tip { radius_m, friction, grasps, coupling })
+        Ok(Tip(palpate_haptics::Tip { shape, radius_m, friction, grasps, coupling }))
     }
 
-    /// The radius of the disc, m.
+    /// The shape: disc, rigid or sphere.
+    #[getter]
+    fn shape(&self) -> &'static str {
+        self.0.shape.name()
+    }
+
+    /// The radius of the disc or sphere, m.
     #[getter]
     fn radius_m(&self) -> f64 {
         self.0.radius_m
@@ -39,7 +57,8 @@ impl Tip {
     }
 
     fn __repr__(&self) -> String {
-        let palpate_haptics::Tip { radius_m, friction, grasps, .. } = self.0;
-        format!("Tip({radius_m}, friction={friction}, grasps={})", if grasps { "True" } else { "False" })
+        let palpate_haptics::Tip { shape, radius_m, friction, grasps, .. } = self.0;
+        let shape = if shape.is_rigid() { format!(", shape=\"{}\"", shape.name()) } else { String::new() };
+        format!("Tip({radius_m}, friction={friction}, grasps={}{shape})", if grasps { "True" } else { "False" })
     }
 }

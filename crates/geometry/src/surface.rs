@@ -7,6 +7,8 @@
 //!
 //! A hat is the piecewise linear function that is 1 at one vertex and 0 at all others.
 
+use std::collections::BTreeSet;
+
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::curvature::curvatures;
@@ -182,6 +184,27 @@ impl Surface {
         let across = (b - a).cross(c - a).normalize().cross(along);
         let barycentric = inside(found.barycentric);
         Some(Place { triangle: found.triangle, barycentric, frame: [along, across] })
+    }
+
+    /// Returns the corners of the triangles around a place, m: of those that are joined to its triangle by others with a
+    /// corner within `reach_m` (m) of the place. They come in the order in which they are found, from the place outward.
+    pub fn triangles_around(&self, place: &Place, reach_m: f64) -> Vec<[DVec3; 3]> {
+        let middle_m = self.at_m(place);
+        let mut found = vec![place.triangle];
+        let mut known: BTreeSet<u32> = BTreeSet::from([place.triangle]);
+        let mut next = 0;
+        while let Some(triangle) = found.get(next).copied() {
+            next += 1;
+            for Beyond { triangle, .. } in self.beyond[triangle as usize] {
+                if triangle != NONE && known.insert(triangle) {
+                    let corners_m = corners(&self.vertices_m, self.triangles[triangle as usize]);
+                    if corners_m.iter().any(|corner_m| corner_m.distance(middle_m) < reach_m) {
+                        found.push(triangle);
+                    }
+                }
+            }
+        }
+        found.iter().map(|triangle| corners(&self.vertices_m, self.triangles[*triangle as usize])).collect()
     }
 
     /// Returns the end of the straight path of length and direction `by_m` from the place `from`, in metres along the

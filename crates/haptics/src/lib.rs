@@ -77,4 +77,4 @@ pub use force_law::Law;
 pub use local_model::{ContactState, LocalModel, Touching, Track};
 pub use prediction::{Predicted, Prediction, Predictor};
 pub use renderer::Renderer;
-pub use tip::{Coupling, Tip};
+pub use tip::{Coupling, Tip, TipShape};

@@ -1,5 +1,7 @@
 //! The tip of a tool that is controlled by its position: its size, its friction and its coupling to the tissue.
 
+use std::str::FromStr;
+
 /// Coupling between a tool and the surface that it touches: how the place of the one follows from the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coupling {
@@ -15,11 +17,59 @@ pub enum Coupling {
     },
 }
 
-/// Properties of a tool's tip that determine its contact with the tissue: a flat disc. The default is a finger on wet
-/// tissue.
+/// The body with which a tool meets the tissue.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum TipShape {
+    /// A disc that presses with an even pressure, and lies on the surface however that turns. The place of the tool is the
+    /// mean of the surface over the disc.
+    #[default]
+    Disc,
+    /// A flat rigid disc. It keeps the direction in which it met the tissue. The place of the tool is its middle.
+    RigidDisc,
+    /// A rigid sphere. The place of the tool is its centre.
+    Sphere,
+}
+
+impl TipShape {
+    /// All shapes, in the order of their numbers in snapshots.
+    pub const ALL: [Self; 3] = [TipShape::Disc, TipShape::RigidDisc, TipShape::Sphere];
+
+    /// Returns the name in scripts.
+    pub fn name(self) -> &'static str {
+        match self {
+            TipShape::Disc => "disc",
+            TipShape::RigidDisc => "rigid",
+            TipShape::Sphere => "sphere",
+        }
+    }
+
+    /// Returns whether the tissue takes the shape of the tip, so that its pressure is part of the solution.
+    pub fn is_rigid(self) -> bool {
+        self != TipShape::Disc
+    }
+
+    /// Returns the distance of the tool's place from the surface when a tip of `radius_m` (m) just touches, m.
+    pub fn height_m(self, radius_m: f64) -> f64 {
+        if self == TipShape::Sphere { radius_m } else { 0.0 }
+    }
+}
+
+impl FromStr for TipShape {
+    type Err = String;
+
+    /// Returns the shape of a name in scripts ([`TipShape::name`]).
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|shape| shape.name() == name);
+        found.ok_or_else(|| format!("must be one of {}", Self::ALL.map(Self::name).join(", ")))
+    }
+}
+
+/// Properties of a tool's tip that determine its contact with the tissue. The default is a finger on wet tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tip {
-    /// Radius of the disc that touches the tissue, m, above 0. The tissue's stiffness in N/m depends on it.
+    /// The body that meets the tissue.
+    pub shape: TipShape,
+    /// Radius of the disc or sphere, m, above 0. The tissue's stiffness in N/m depends on it.
     pub radius_m: f64,
     /// Coefficient μ of Coulomb friction, 0 or more; unused for a grasp.
     pub friction: f64,
@@ -30,8 +80,8 @@ pub struct Tip {
 }
 
 impl Default for Tip {
-    /// Returns the tip of a finger on wet tissue: 5 mm, μ = 0.2, no grasp, a constraint.
+    /// Returns the tip of a finger on wet tissue: a disc of 5 mm, μ = 0.2, no grasp, a constraint.
     fn default() -> Self {
-        Tip { radius_m: 0.005, friction: 0.2, grasps: false, coupling: Coupling::Constraint }
+        Tip { shape: TipShape::Disc, radius_m: 0.005, friction: 0.2, grasps: false, coupling: Coupling::Constraint }
     }
 }

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_haptics::TipShape;
 use palpate_refusal::Result;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
@@ -31,9 +32,11 @@ const DEPTHS: usize = 20;
 pub struct Indentation {
     /// Where it goes in, m: the nearest place of the rest surface. `None` for the place that stands for the tissue.
     pub place_m: Option<DVec3>,
-    /// Radius of the tip, m: an even pressure on this disc.
+    /// The body that goes in.
+    pub shape: TipShape,
+    /// Radius of the tip, m.
     pub radius_m: f64,
-    /// Largest depth, m, the mean over the disc.
+    /// Largest depth, m: of a disc of even pressure the mean over it, of a sphere that of its lowest place.
     pub depth_m: f64,
     /// Mean speed on the way in and back, m/s.
     pub speed_m_per_s: f64,
@@ -42,7 +45,7 @@ pub struct Indentation {
 /// Force at one depth of an indentation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthForce {
-    /// Depth of the tip, the mean over its disc, m.
+    /// Depth of the tip, m.
     pub depth_m: f64,
     /// Outward force of the tissue on the tip on the way in, N.
     pub loading_n: f64,
@@ -80,11 +83,19 @@ impl Indented {
 }
 
 impl Indentation {
-    /// Returns Young's modulus of the half space that would be as stiff under a disc of even pressure,
-    /// E = 16·(1 − ν²)·k/(3π²·a) with k = F/ū (Timoshenko and Goodier, Theory of Elasticity, section 139), Pa.
-    pub fn apparent_modulus_pa(&self, stiffness_n_per_m: f64, poissons_ratio: f64) -> f64 {
-        let nu = poissons_ratio;
-        16.0 * (1.0 - nu * nu) * stiffness_n_per_m / (3.0 * std::f64::consts::PI.powi(2) * self.radius_m)
+    /// Returns Young's modulus of the half space that would resist this tip with the same force at the same depth, Pa. With k the
+    /// force over the depth d: E = 16·(1 − ν²)·k/(3π²·a) for an even pressure (Timoshenko and Goodier, Theory of Elasticity,
+    /// section 139), (1 − ν²)·k/(2a) for a rigid disc (Boussinesq), and 3·(1 − ν²)·k/(4·√(a·d)) for a sphere (Hertz).
+    pub fn apparent_modulus_pa(&self, row: &DepthForce, poissons_ratio: f64) -> f64 {
+        let compliance = 1.0 - poissons_ratio * poissons_ratio;
+        let (radius_m, stiffness) = (self.radius_m, row.loading_n / row.depth_m);
+        compliance
+            * stiffness
+            * match self.shape {
+                TipShape::Disc => 16.0 / (3.0 * std::f64::consts::PI.powi(2) * radius_m),
+                TipShape::RigidDisc => 0.5 / radius_m,
+                TipShape::Sphere => 0.75 / (radius_m * row.depth_m).sqrt(),
+            }
     }
 
     /// Returns the script of the indentation: its only tool is the tip.
@@ -94,10 +105,12 @@ impl Indentation {
     fn script(&self, model: &Model, limits: &Limits) -> Result<(Script, DVec3, DVec3)> {
         let (place_m, outward) = self.on_surface(model);
         let away_m = CLEARANCE * self.radius_m;
-        let at = |out_m: f64| (place_m + out_m * outward).to_array();
+        let height_m = self.shape.height_m(self.radius_m);
+        let at = |out_m: f64| (place_m + (height_m + out_m) * outward).to_array();
         let [down_s, rest_s, up_s] = self.times_s();
         let mut text = format!("name = \"indent\"\nduration_s = {up_s:?}\nsample_every_s = {SAMPLE_S}\n\n[[tool]]\n");
-        let _ = write!(text, "tip = {{ radius_m = {:?}, friction = 0.0 }}\nposes = [\n", self.radius_m);
+        let (shape, radius_m) = (self.shape.name(), self.radius_m);
+        let _ = write!(text, "tip = {{ shape = {shape:?}, radius_m = {radius_m:?}, friction = 0.0 }}\nposes = [\n");
         for (at_s, out_m) in [(0.0, away_m), (down_s, -self.depth_m), (rest_s, -self.depth_m), (up_s, away_m)] {
             let _ = writeln!(text, "    {{ at_s = {at_s:?}, place_m = {:?} }},", at(out_m));
         }
@@ -139,12 +152,13 @@ impl Indentation {
     ) -> std::result::Result<Indented, SimulationFailure> {
         let (script, place_m, outward) = self.script(model, limits).map_err(SimulationFailure::Refused)?;
         let mut samples: Vec<(f64, f64)> = Vec::new();
+        let height_m = self.shape.height_m(self.radius_m);
         let options = RunOptions::default();
         let summary = run_with(model, &script, options, limits, clock_s, &mut |event| {
             match event {
                 RunEvent::Record(record) => {
                     let sample = record.tools.first().map(|tool| {
-                        let depth_m = -outward.dot(DVec3::from_array(tool.place_m) - place_m);
+                        let depth_m = height_m - outward.dot(DVec3::from_array(tool.place_m) - place_m);
                         (depth_m, outward.dot(DVec3::from_array(tool.force_on_tool_n)))
                     });
                     samples.extend(sample);

@@ -687,7 +687,7 @@ impl Session {
     pub fn tool_on_fixed(&self) -> Option<u32> {
         let presses = |number: &usize| {
             let feel = self.tissue.tool_contact(*number);
-            feel.is_some_and(|feel| feel.is_on_fixed && (feel.place_m - feel.surface_m).dot(feel.normal) < 0.0)
+            feel.is_some_and(|feel| feel.is_on_fixed && (feel.place_m - feel.touching_m).dot(feel.normal) < 0.0)
         };
         (0..self.tools.len()).find(presses).map(|number| number as u32)
     }

@@ -106,9 +106,9 @@ impl Modeller {
             // A dent tilts the surface under a tool; the law refers to the surface at rest.
             self.surface = feel.rest.map(|rest| (rest.place_m, rest.normal)).or(self.surface);
         } else if !(1..=BOUNCE_SAMPLES).contains(&self.bounced) {
-            self.surface = Some((feel.surface_m, feel.normal));
+            self.surface = Some((feel.touching_m, feel.normal));
         }
-        let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));
+        let (mut surface_m, normal) = self.surface.unwrap_or((feel.touching_m, DVec3::Z));
         let mut depth_m = (surface_m - feel.place_m).dot(normal);
         if touches {
             // Put the surface where the law gives this force, so that the law passes through this sample.
@@ -178,6 +178,7 @@ mod tests {
             contact_state,
             force_on_tool_n: DVec3::ZERO,
             surface_m: surface_m * DVec3::Z,
+            touching_m: surface_m * DVec3::Z,
             anchor_m: DVec3::ZERO,
             normal: DVec3::Z,
             rest: None,

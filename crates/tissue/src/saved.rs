@@ -17,7 +17,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip, TipShape};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::limits::Limits;
@@ -265,6 +265,19 @@ pub(crate) struct SavedContact {
     pub(crate) force_n: Vector,
     pub(crate) steady_n: Vector,
     pub(crate) velocity_m_per_s: Vector,
+    pub(crate) pressing: Option<SavedPressing>,
+}
+
+/// How a rigid tip presses: the place around which its samples were taken, the axis of the tip, by how much it is still drawn
+/// back, m, and the forces (N) on samples by their number.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedPressing {
+    pub(crate) around: SavedPlace,
+    pub(crate) axis: Vector,
+    pub(crate) drawn_back_m: f64,
+    /// Energy of the tip's skin, J.
+    pub(crate) stored_j: f64,
+    pub(crate) forces_n: Vec<(u32, Vector)>,
 }
 
 /// The place of a tip's disc on the tissue at rest, as the kind of tissue describes its places: in the plane z = 0, m, or
@@ -336,6 +349,8 @@ pub(crate) enum SavedGrasp {
 /// A [`Tip`] as plain data, in a snapshot. Nothing of it is checked before [`SavedTip::restored`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SavedTip {
+    /// The number of the shape in [`TipShape::ALL`].
+    shape: u8,
     radius_m: f64,
     friction: f64,
     grasps: bool,
@@ -586,12 +601,12 @@ pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Resu
 impl SavedTip {
     /// Converts a tip to plain data, without rounding.
     pub fn of(tip: &Tip) -> Self {
-        let Tip { radius_m, friction, grasps, coupling } = *tip;
+        let Tip { shape, radius_m, friction, grasps, coupling } = *tip;
         let spring = match coupling {
             Coupling::Constraint => None,
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Some((stiffness_n_per_m, damping_n_s_per_m)),
         };
-        SavedTip { radius_m, friction, grasps, spring }
+        SavedTip { shape: shape as u8, radius_m, friction, grasps, spring }
     }
 
     /// Checks a saved tip against a tissue and returns it.
@@ -600,12 +615,14 @@ impl SavedTip {
     /// Refuses a tip that a command may not have either ([`check_tip`]): a radius that is not above 0 or too large for
     /// the tissue, a friction outside 0 to 10, or a coupling out of range. The field is that of `snapshot.tip`.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
-        let SavedTip { radius_m, friction, grasps, spring } = *self;
+        let SavedTip { shape, radius_m, friction, grasps, spring } = *self;
+        let shape =
+            TipShape::ALL.get(usize::from(shape)).copied().ok_or_else(|| unsound("an unknown shape of a tip"))?;
         let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        let tip = Tip { radius_m, friction, grasps, coupling };
+        let tip = Tip { shape, radius_m, friction, grasps, coupling };
         check_tip("snapshot.tip", checks.shape, &tip)?;
         Ok(tip)
     }

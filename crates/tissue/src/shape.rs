@@ -349,6 +349,11 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         0
     }
 
+    /// Returns whether rigid tips can touch it.
+    fn takes_rigid_tips(&self) -> bool {
+        false
+    }
+
     /// Returns whether the normal of every point is +z, so that z alone tells how far a point was pressed.
     fn faces_up(&self) -> bool {
         false

@@ -414,7 +414,10 @@ mod tests {
         assert_eq!(lint[2], "cargo clippy --release --workspace --all-targets -- -D warnings");
         let [install, typescript, viewer] = &lint[3..] else { panic!("{lint:?}") };
         assert_eq!(install, "(in clients) npm ci   # at the same time");
-        assert!([typescript, viewer].iter().all(|line| line.ends_with("npm run lint   # at the same time")), "{lint:?}");
+        assert!(
+            [typescript, viewer].iter().all(|line| line.ends_with("npm run lint   # at the same time")),
+            "{lint:?}"
+        );
         assert_eq!(
             lines(&ProjectTask::Page, &machine(false)),
             ["(in clients) npm ci", "(in clients/viewer) npm run build"]

@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
 use glam::DVec3;
-use palpate_haptics::{Law, Tip};
+use palpate_haptics::{Law, Tip, TipShape};
 use palpate_refusal::{Reason, Refusal, number};
 use palpate_simulated::network::{Conditions, Transport};
 use palpate_tissue::Model;
@@ -114,6 +114,9 @@ pub(crate) struct LinkArguments {
     /// Place of the task, m: the nearest place of the tissue's rest surface; for a sheet X,Y [default: the middle]
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["random", "boundary"])]
     place: Vec<f64>,
+    /// The tool's tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid
+    #[arg(long, value_name = "SHAPE", default_value = "disc", conflicts_with = "random")]
+    tip: TipShape,
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
     radius_m: f64,
@@ -243,7 +246,8 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let scene = find_scene(&arguments.scene, Path::new("scenes"), &[], &limits).map_err(|refusal| {
         if refusal.place.is_none() { Refusal { field: "--scene".to_owned(), ..refusal } } else { refusal }
     })?;
-    let tip = Tip { radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
+    let tip =
+        Tip { shape: arguments.tip, radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
     check_tip("--tip", scene.shape(), &tip)?;
     let model = Model::compile(&scene, &limits)?;
     let near_m = match (arguments.place.as_slice(), model.shape().dimensions()) {
@@ -257,7 +261,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
         }
     };
     model.shape().check_place("--place", near_m)?;
-    let spot = Spot::new(&model, near_m, tip.radius_m);
+    let spot = Spot::new(&model, near_m, &tip);
     // A server first sends the law of the middle, and before the first press that of the place.
     let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
     let laws = Arc::new(PlaceLaws::new(&model));

@@ -1,7 +1,7 @@
 //! The place of a task on the tissue.
 
 use glam::{DMat3, DQuat, DVec3};
-use palpate_haptics::LocalModel;
+use palpate_haptics::{LocalModel, Tip};
 use palpate_tissue::{Footprint, Model};
 
 /// The place of a task on a surface, with the hand's frame: the task's origin is there, and z points out of the
@@ -12,18 +12,22 @@ pub(super) struct Spot {
     pub(super) at_m: DVec3,
     /// Rotation from the tissue's frame to the hand's frame.
     turn: DMat3,
+    /// From a place of the hand to that of the tool, m, in the tissue's frame: the hand's is at the surface when the tip just
+    /// touches.
+    above_m: DVec3,
 }
 
 impl Spot {
-    /// Returns the place of the rest surface that is nearest to `near_m`, for a disc of `radius_m`.
-    pub(super) fn new(model: &Model, near_m: DVec3, radius_m: f64) -> Self {
-        let (at_m, outward) = Footprint::new(model, radius_m, near_m).at_rest();
-        Spot { at_m, turn: DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z)) }
+    /// Returns the place of the rest surface that is nearest to `near_m`, for a tip.
+    pub(super) fn new(model: &Model, near_m: DVec3, tip: &Tip) -> Self {
+        let (at_m, outward) = Footprint::new(model, tip.radius_m, near_m).at_rest();
+        let turn = DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z));
+        Spot { at_m, turn, above_m: tip.shape.height_m(tip.radius_m) * outward }
     }
 
     /// Converts a place in the hand's frame to the tissue's frame.
     pub(super) fn of_tissue(&self, place_m: DVec3) -> DVec3 {
-        self.at_m + self.turn.transpose() * (place_m - self.at_m)
+        self.at_m + self.above_m + self.turn.transpose() * (place_m - self.at_m)
     }
 
     /// Converts a direction (a velocity or force) in the tissue's frame to the hand's frame.
@@ -43,7 +47,7 @@ impl Spot {
 
     /// Converts a local model of the tissue to the hand's frame.
     pub(super) fn of_hand(&self, model: LocalModel) -> LocalModel {
-        let place = |place_m: DVec3| self.at_m + self.turn * (place_m - self.at_m);
+        let place = |place_m: DVec3| self.at_m + self.turn * (place_m - self.above_m - self.at_m);
         let tensor = |of_tissue: DMat3| self.turn * of_tissue * self.turn.transpose();
         LocalModel {
             place_m: place(model.place_m),

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_geometry::{Group, TriangleMesh};
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip, TipShape};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::journal as pb;
 
@@ -239,8 +239,9 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
                     (Some(stiffness_n_per_m), damping_n_s_per_m)
                 }
             };
-            let Tip { radius_m, friction, grasps, .. } = *tip;
-            let tip = pb::Tip { radius_m, friction, grasps, spring_n_per_m, spring_n_s_per_m };
+            let Tip { shape, radius_m, friction, grasps, .. } = *tip;
+            let shape = shape as u32;
+            let tip = pb::Tip { radius_m, friction, grasps, spring_n_per_m, spring_n_s_per_m, shape };
             let is_same = tips.insert(command.tool, tip) == Some(tip);
             Message::Pose(pb::Pose {
                 place_m: vector(*place_m),
@@ -311,6 +312,8 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
         },
         Message::Pose(pose) => {
             let tip = required("pose.tip", pose.tip.as_ref())?;
+            let shape = usize::try_from(tip.shape).ok().and_then(|number| TipShape::ALL.get(number).copied());
+            let shape = shape.ok_or_else(|| Refusal::new(Reason::OutOfRange, "pose.tip.shape", "is unknown"))?;
             let coupling = tip.spring_n_per_m.map_or(Coupling::Constraint, |stiffness_n_per_m| Coupling::Spring {
                 stiffness_n_per_m,
                 damping_n_s_per_m: tip.spring_n_s_per_m,
@@ -318,7 +321,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
             Action::Pose {
                 place_m: from_vector(pose.place_m.as_ref()),
                 velocity_m_per_s: pose.velocity_m_per_s.as_ref().map(|velocity| from_vector(Some(velocity))),
-                tip: Tip { radius_m: tip.radius_m, friction: tip.friction, grasps: tip.grasps, coupling },
+                tip: Tip { shape, radius_m: tip.radius_m, friction: tip.friction, grasps: tip.grasps, coupling },
             }
         }
         Message::Release(_) => Action::Release,

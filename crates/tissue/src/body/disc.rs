@@ -5,8 +5,19 @@ use std::fmt;
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::saved::SavedPlace;
-use crate::shape::PointId;
+use crate::shape::{CellPlace, PointId};
 use palpate_refusal::Result;
+
+/// A small part of the surface of a tissue, which moves with the cube around it.
+#[derive(Debug, Clone)]
+pub(crate) struct SurfaceSample {
+    /// Its middle at rest, m.
+    pub(crate) rest_m: DVec3,
+    /// Unit normal out of the tissue at rest.
+    pub(crate) outward: DVec3,
+    pub(crate) area_m2: f64,
+    pub(crate) cell: CellPlace,
+}
 
 /// The disc of a tool on a kind of tissue, at a place of the rest surface. `body::footprint` asks it which points it
 /// covers, and computes everything else. All directions along the surface are those of the gradients of
@@ -68,6 +79,12 @@ pub(crate) trait TissueDisc: fmt::Debug + Send + Sync {
     /// flat tissue presses on it from above.
     fn side(&self, _height_m: f64) -> f64 {
         1.0
+    }
+
+    /// Returns samples of the surface around the place, at most `spacing_m` apart, as far as `reach_m` away, in a fixed
+    /// order, m. Empty where rigid tips can't touch ([`RestShape::takes_rigid_tips`](crate::shape::RestShape)).
+    fn samples(&self, _reach_m: f64, _spacing_m: f64) -> Vec<SurfaceSample> {
+        Vec::new()
     }
 
     /// Returns the weight of a movable point, which need not be covered; `None` if the points of [`TissueDisc::cover`]

@@ -15,7 +15,7 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::body::disc::TissueDisc;
+use crate::body::disc::{SurfaceSample, TissueDisc};
 use crate::body::disc_on;
 use crate::body::model::Model;
 use crate::saved::{SavedPlace, ensure};
@@ -113,6 +113,11 @@ impl Footprint {
     fn is_sound(&self) -> bool {
         let is_sound = |point: &WeightedNode| point.weight.is_finite() && point.gradient.is_finite();
         self.rest_m.is_finite() && self.relative_inverse_mass.is_finite() && self.reached.iter().all(is_sound)
+    }
+
+    /// Returns samples of the surface around the place ([`TissueDisc::samples`]).
+    pub(crate) fn samples(&self, reach_m: f64, spacing_m: f64) -> Vec<SurfaceSample> {
+        self.disc.samples(reach_m, spacing_m)
     }
 
     /// Returns the radius of the disc, m.

@@ -2,9 +2,12 @@
 
 use std::sync::Arc;
 
+use glam::DVec3;
+
 use crate::body::MemoryLayout;
 use crate::body::Places;
-use crate::kernel::field::{BLOCK, Layout};
+use crate::kernel::field::{BLOCK, Layout, State};
+use crate::kernel::real::Real;
 use crate::scene::graph::GraphFault;
 use crate::scene::{Integrator, Lanes, Precision, Scene};
 use crate::scheme::stability;
@@ -313,6 +316,13 @@ impl Model {
     pub(crate) fn index_of(&self, [i, j]: [usize; 2]) -> usize {
         i * self.points[1] + j
     }
+}
+
+/// Returns the displacement of a point from rest, m. For a multistep scheme, it is the predicted one.
+pub(crate) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
+    let at = i * layout.stride + j;
+    let component = |c: usize| state.u[c * layout.plane + at].wide() * model.unit_m;
+    DVec3::new(component(0), component(1), component(2))
 }
 
 #[cfg(test)]

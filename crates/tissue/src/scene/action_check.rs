@@ -82,13 +82,25 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
 /// Refuses a value that is not finite or out of range: a radius must be above 0 and at most the tissue's
 /// longest side, and on a mesh at most 32 mean edge lengths; friction is from 0 to 10; a coupling spring has a
 /// stiffness from 1e-12 to 1e12 N/m and a damping from 0 to 1e12 N·s/m. `field` is the tip's key: the refusal
-/// gives `{field}.radius_m` and the like.
+/// gives `{field}.radius_m` and the like. A rigid shape is for solids, without a grasp and without a spring.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let (most_m, what) = shape.most_tip_radius_m();
     let range = format!("above 0 and at most {}, {what}", legible(most_m));
     number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)
         .map_err(in_millimetres(tip.radius_m, most_m))?;
     number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+    if tip.shape.is_rigid() {
+        let refuse = |message: &str| Err(Refusal::new(Reason::OutOfRange, format!("{field}.shape"), message));
+        if !shape.takes_rigid_tips() {
+            return refuse("a rigid tip needs a solid: this tissue is touched by a \"disc\"");
+        }
+        if tip.grasps {
+            return refuse("a tip that grasps is a \"disc\"");
+        }
+        if tip.coupling != Coupling::Constraint {
+            return refuse("a tip on a spring is a \"disc\"");
+        }
+    }
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
         let field = format!("{field}.spring");
         physical(&format!("{field}.stiffness_n_per_m"), stiffness_n_per_m)?;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip, TipShape};
 
 use super::kind::TextKind;
 use super::profile::{
@@ -527,7 +527,11 @@ fn read_tip(fields: &mut Fields<'_>) -> Result<Tip> {
             Ok(Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m })
         })?,
     };
+    let shape = fields.item("shape").map_or(Ok(standard.shape), |item| {
+        item.text()?.parse::<TipShape>().map_err(|message| item.refuse(Reason::OutOfRange, message))
+    })?;
     Ok(Tip {
+        shape,
         radius_m: fields.number("radius_m")?.unwrap_or(standard.radius_m),
         friction: fields.number("friction")?.unwrap_or(standard.friction),
         grasps: fields.item("grasps").map_or(Ok(standard.grasps), |item| item.flag())?,

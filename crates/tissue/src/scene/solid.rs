@@ -17,7 +17,7 @@ use super::springs::Springs;
 use crate::limits::Limits;
 use crate::scene::action_check::physical;
 use crate::scene::toml_document::{Fields, Item};
-use crate::shape::{PointId, RestShape};
+use crate::shape::{CellPlace, PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
 
 mod fixed;
@@ -127,6 +127,13 @@ impl Solid {
             _ => refusal,
         };
         Ok(Solid::new(Arc::new(shape.map_err(named)?), material))
+    }
+
+    /// Returns Young's modulus of the cube around a place, Pa.
+    pub(crate) fn modulus_pa(&self, place: &CellPlace) -> f64 {
+        let shape = &self.shape;
+        let cell = shape.lattice().index(shape.corner_at(shape.corner_of(PointId::new(place.points[0] as usize))));
+        self.material.youngs_modulus_pa * self.weights[cell] / shape.counted_part(cell).max(f64::MIN_POSITIVE)
     }
 
     /// Creates a solid of a material without inclusions.

@@ -72,7 +72,7 @@ impl Action {
             Action::Grasp { point, displacement_m } => {
                 Action::Grasp { point, displacement_m: unsigned(displacement_m) }
             }
-            Action::Pose { place_m, velocity_m_per_s, tip: Tip { radius_m, friction, grasps, coupling } } => {
+            Action::Pose { place_m, velocity_m_per_s, tip: Tip { shape, radius_m, friction, grasps, coupling } } => {
                 let coupling = match coupling {
                     Coupling::Constraint => Coupling::Constraint,
                     Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Coupling::Spring {
@@ -81,7 +81,7 @@ impl Action {
                     },
                 };
                 let (radius_m, friction) = (unsigned_zero(radius_m), unsigned_zero(friction));
-                let tip = Tip { radius_m, friction, grasps, coupling };
+                let tip = Tip { shape, radius_m, friction, grasps, coupling };
                 let velocity_m_per_s = velocity_m_per_s.map(unsigned);
                 Action::Pose { place_m: unsigned(place_m), velocity_m_per_s, tip }
             }

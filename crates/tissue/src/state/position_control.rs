@@ -5,12 +5,13 @@ use glam::DVec3;
 use palpate_haptics::ContactState;
 
 use crate::body::footprint::WeightedNode;
-use crate::body::model::{Model, Plan};
+use crate::body::model::{Model, Plan, displacement_m};
 use crate::body::tables::SweepTables;
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
 use crate::state::step_context::StepContext;
-use crate::tools::contact::{ContactForce, Contacts, Tool, ToolContact, displacement_m, movement_m, push, within_cone};
+use crate::tools::contact::{ContactForce, Contacts, Tool, ToolContact, movement_m, push, within_cone};
+use crate::tools::rigid_tip::RigidTip;
 use palpate_haptics::Coupling;
 
 impl Contacts {
@@ -21,6 +22,11 @@ impl Contacts {
         let StepContext { model, plan, tables, state, applied, tiles, work } = context;
         let (unit_j, layout) = (plan.unit_of_work_j(model), &tables.layout);
         for tool in &mut self.tools {
+            if let Some(rigid) = tool.rigid.take() {
+                let context = &mut StepContext { model, plan, tables, state, applied, tiles, work };
+                tool.rigid = Some(tool.act_rigid(rigid, context, fraction, far));
+                continue;
+            }
             let (before_n, met) = (tool.steady_n, tool.contact_state != ContactState::Free);
             let is_new = tool.is_new;
             if before_n != DVec3::ZERO {
@@ -117,11 +123,68 @@ impl Contacts {
 }
 
 impl Tool {
+    /// Makes a rigid tip act at the end of a substep, as [`Contacts::act`] does.
+    fn act_rigid<T: Real>(
+        &mut self,
+        mut rigid: RigidTip,
+        context: &mut StepContext<'_, T>,
+        fraction: f64,
+        far: f64,
+    ) -> RigidTip {
+        let StepContext { model, plan, tables, state, applied, tiles, work } = context;
+        let (unit_j, layout) = (plan.unit_of_work_j(model), &tables.layout);
+        let (place_m, was_pressing) = (self.place_m(fraction), rigid.is_pressing());
+        if was_pressing {
+            tiles.wake_under(rigid.points());
+        } else {
+            self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
+        }
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let outward = self.footprint.outward(&along);
+        let gap_m = place_m - surface_m;
+        if let Some(off_m) = rigid.off_m(gap_m, outward).filter(|_| was_pressing) {
+            self.footprint.shift(model, off_m.clamp_length_max(self.footprint.stride_m()), &along);
+        }
+        (self.normal, self.side, self.is_new) = (outward, Some(1.0), false);
+        if !was_pressing && rigid.is_far(gap_m) {
+            self.leave();
+            return rigid;
+        }
+        work.add(rigid.follow(model, &self.footprint, outward));
+        rigid.go_on(model, plan, layout, state, 1.0);
+        let pressed = rigid.press(model, plan, layout, state, [place_m, self.own_movement_m(model, plan)]);
+        rigid.kick(model, plan, layout, state);
+        if was_pressing || pressed.contact_state.is_some() {
+            tiles.wake_under(rigid.points());
+            rigid.moved(model, plan, far).for_each(|point| tiles.wake_around(point, plan.scheme.sweeps()));
+        }
+        // Forces of other tools on these points also do work along this movement.
+        if !applied.terms.is_empty() {
+            for (point, movement) in rigid.movements(model, plan) {
+                work.add(applied.work_along(model, plan, layout, point, movement.to_array()) * unit_j);
+            }
+        }
+        work.add(pressed.force_n.dot(pressed.moved_m));
+        match pressed.contact_state {
+            Some(contact_state) => {
+                (self.contact_state, self.force_n, self.steady_n) = (contact_state, pressed.force_n, pressed.force_n);
+            }
+            None => self.leave(),
+        }
+        rigid
+    }
+
+    /// Loses contact.
+    fn leave(&mut self) {
+        (self.contact_state, self.force_n, self.steady_n) = (ContactState::Free, DVec3::ZERO, DVec3::ZERO);
+    }
+
     /// Returns the motion of the tool and the force on it. `without_inertia` gives the force under which the disc is
     /// not accelerated, N.
     pub(crate) fn contact(&self, surface_m: DVec3, without_inertia: impl FnOnce() -> DVec3) -> ToolContact {
         let felt_n = match (self.contact_state, self.tip.coupling) {
             (ContactState::Free, _) => DVec3::ZERO,
+            _ if self.rigid.is_some() => -self.force_n,
             (_, Coupling::Spring { .. }) => -self.force_n,
             (contact_state, Coupling::Constraint) => {
                 let felt_n = without_inertia();
@@ -140,6 +203,7 @@ impl Tool {
             contact_state: self.contact_state,
             force_on_tool_n: felt_n,
             surface_m,
+            touching_m: surface_m + self.tip.shape.height_m(self.tip.radius_m) * self.normal,
             anchor_m: self.footprint.anchor_m(),
             normal: self.normal,
             rest: self.footprint.rest_surface(self.side.unwrap_or(1.0)),

@@ -9,7 +9,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::body::force_field::Term;
-use crate::body::model::{Model, Plan};
+use crate::body::model::{Model, Plan, displacement_m};
 use crate::body::tables::{SweepTables, springs_of};
 use crate::body::window::Window;
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
@@ -31,7 +31,7 @@ use crate::state::point_reader::PointReader;
 use crate::state::sleep::criterion::add_sleeping;
 use crate::state::sleep::tiles::SleepTiles;
 use crate::tools::applied_force::{Applied, Push};
-use crate::tools::contact::{Contacts, TangentInput, ToolContact, displacement_m};
+use crate::tools::contact::{Contacts, TangentInput, ToolContact};
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::{Grasp, Prescribed};
 use palpate_haptics::{ContactState, Tip};

@@ -52,12 +52,13 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::body::footprint::{Footprint, RestSurface, WeightedNode};
-use crate::body::model::{Model, Plan};
+use crate::body::model::{Model, Plan, displacement_m};
 use crate::body::window::Window;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
 use crate::response::tangent::{LinearPatch, Tangent};
 use crate::saved::{Checks, SavedContact, SavedTip, ensure};
+use crate::tools::rigid_tip::RigidTip;
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_refusal::Result;
 
@@ -89,6 +90,8 @@ pub struct ToolContact {
     pub force_on_tool_n: DVec3,
     /// Place of the displaced surface under the tool, m: the middle of its disc.
     pub surface_m: DVec3,
+    /// Place of the tool at which it would just touch that surface, m: of a sphere, a radius above it.
+    pub touching_m: DVec3,
     /// Rest position of the place of the tissue under the tool, m.
     pub anchor_m: DVec3,
     /// Unit normal of the surface under the tool, on the tool's side of it.
@@ -147,11 +150,17 @@ pub(crate) struct Tool {
     /// The part of that force that continues in the next substep, without the impulse of meeting.
     pub(crate) steady_n: DVec3,
     pub(crate) velocity_m_per_s: DVec3,
+    /// How a rigid tip presses; `None` for a disc of even pressure.
+    pub(crate) rigid: Option<RigidTip>,
 }
 
 /// The states of contact, in the order of their numbers in snapshots.
 const CONTACT_STATES: [ContactState; 4] =
     [ContactState::Free, ContactState::Sticking, ContactState::Sliding, ContactState::Holding];
+
+fn rigid_tip(tip: Tip) -> Option<RigidTip> {
+    tip.shape.is_rigid().then(|| RigidTip::new(tip))
+}
 
 /// All position-controlled tools.
 #[derive(Debug, Clone, Default)]
@@ -164,13 +173,15 @@ impl Contacts {
     /// Makes the tool reach `to_m` at the next step's end. A new tool begins there.
     pub(crate) fn pose(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
         if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
-            let is_other = tool.tip.radius_m != tip.radius_m;
+            let is_other = (tool.tip.radius_m, tool.tip.shape) != (tip.radius_m, tip.shape);
             if is_other {
+                tool.rigid = rigid_tip(tip);
                 tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.anchor_m());
             }
             if is_other || tool.tip.grasps != tip.grasps {
                 (tool.contact_state, tool.steady_n, tool.is_new) = (ContactState::Free, DVec3::ZERO, true);
             }
+            tool.rigid.iter_mut().for_each(|rigid| rigid.set_friction(tip.friction));
             (tool.to_m, tool.tip) = (to_m, tip);
             return;
         }
@@ -190,6 +201,7 @@ impl Contacts {
             force_n: DVec3::ZERO,
             steady_n: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
+            rigid: rigid_tip(tip),
         };
         self.tools.insert(index, tool);
     }
@@ -215,13 +227,17 @@ impl Contacts {
 
     /// Returns the points under tools that touch or hold. Some occur more than once.
     pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
-        self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::points)
+        self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::moved_points)
     }
 
     /// Returns the continuing force of these tools on a point, N.
     pub(crate) fn steady_on(&self, model: &Model, index: usize) -> DVec3 {
         let pressing = self.tools.iter().filter(|tool| tool.steady_n != DVec3::ZERO);
-        pressing.map(|tool| tool.footprint.weight_of(model, index) * tool.steady_n).sum()
+        let of = |tool: &Tool| match &tool.rigid {
+            Some(rigid) => rigid.steady_on(index),
+            None => tool.footprint.weight_of(model, index) * tool.steady_n,
+        };
+        pressing.map(of).sum()
     }
 
     pub(crate) fn release(&mut self, number: usize) {
@@ -235,13 +251,6 @@ impl Contacts {
             tool.from_m = tool.to_m;
         }
     }
-}
-
-/// Returns the displacement of a point from rest, m. For a multistep scheme, it is the predicted one.
-pub(crate) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
-    let at = i * layout.stride + j;
-    let component = |c: usize| state.u[c * layout.plane + at].wide() * model.unit_m;
-    DVec3::new(component(0), component(1), component(2))
 }
 
 /// Adds to u and d of the disc's points the effect of `force_n` with the factors `[of_u, of_d]`
@@ -298,6 +307,7 @@ impl Tool {
             force_n: self.force_n.into(),
             steady_n: self.steady_n.into(),
             velocity_m_per_s: self.velocity_m_per_s.into(),
+            pressing: self.rigid.as_ref().and_then(RigidTip::saved),
         }
     }
 
@@ -306,10 +316,15 @@ impl Tool {
         let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
         ensure(contact_state.is_some(), "an unknown state of contact")?;
         ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "an unknown side of the tissue")?;
+        let footprint = Footprint::restored(model, tip.radius_m, &saved.place)?;
+        let rigid = match tip.shape.is_rigid() {
+            true => Some(RigidTip::restored(saved.pressing.as_ref(), tip, &footprint, model, checks)?),
+            false => None,
+        };
         Ok(Tool {
             number: checks.tool(saved.number)?,
             tip,
-            footprint: Footprint::restored(model, tip.radius_m, &saved.place)?,
+            footprint,
             from_m: checks.vector(saved.from_m)?,
             to_m: checks.vector(saved.to_m)?,
             contact_state: contact_state.unwrap_or(ContactState::Free),
@@ -321,7 +336,14 @@ impl Tool {
             force_n: checks.vector(saved.force_n)?,
             steady_n: checks.vector(saved.steady_n)?,
             velocity_m_per_s: checks.vector(saved.velocity_m_per_s)?,
+            rigid,
         })
+    }
+
+    /// Returns the points that the tip may move.
+    pub(crate) fn moved_points(&self) -> impl Iterator<Item = [usize; 2]> {
+        let of_disc = self.rigid.is_none().then(|| self.points());
+        of_disc.into_iter().flatten().chain(self.rigid.iter().flat_map(RigidTip::points))
     }
 
     /// Returns the points of the disc.
@@ -581,13 +603,17 @@ impl Tool {
         *gap_m += (kept_m - offset_m) * mean;
     }
 
-    /// Returns whether a spring couples the tool to the tissue at present.
+    /// Returns whether a spring, or the skin of a rigid tip, couples the tool to the tissue at present.
     pub(crate) fn is_coupled(&self) -> bool {
-        self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })
+        self.rigid.is_some()
+            || self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })
     }
 
     /// Returns the energy of that spring, J, while the disc is at `surface_m` and the tool at `place_m`.
     pub(crate) fn stored_j(&self, surface_m: DVec3, place_m: DVec3) -> f64 {
+        if let Some(rigid) = &self.rigid {
+            return rigid.stored_j();
+        }
         match self.tip.coupling {
             Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
                 let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();

@@ -8,12 +8,15 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::body::disc::TissueDisc;
+use crate::body::disc::{SurfaceSample, TissueDisc};
 use crate::body::surface::footprint::MeshDisc;
 use crate::saved::SavedPlace;
 use crate::scene::SolidShape;
 use crate::shape::{CellPlace, PointId};
 use palpate_refusal::Result;
+
+/// A side of a triangle is divided into at most so many parts.
+const MAX_SIDE_PARTS: f64 = 16.0;
 
 /// The part of a vertex's weight and derivative that a point gets.
 #[derive(Debug, Clone, Copy)]
@@ -97,6 +100,34 @@ impl TissueDisc for SolidDisc {
                 .sum()
         };
         self.disc.leap(place_m, &of_vertex)
+    }
+
+    /// Divides each triangle into equal ones of the same shape, and takes their middles.
+    fn samples(&self, reach_m: f64, spacing_m: f64) -> Vec<SurfaceSample> {
+        let mut samples = Vec::new();
+        for [a, b, c] in self.disc.triangles_around(reach_m) {
+            let longest_m = (b - a).length().max((c - b).length()).max((a - c).length());
+            let parts = (longest_m / spacing_m).ceil().clamp(1.0, MAX_SIDE_PARTS);
+            let cross = (b - a).cross(c - a);
+            let area_m2 = 0.5 * cross.length() / (parts * parts);
+            let (along, across) = ((b - a) / parts, (c - a) / parts);
+            let mut add = |by_along: f64, by_across: f64| {
+                let rest_m = a + by_along * along + by_across * across;
+                let outward = cross.normalize_or_zero();
+                samples.push(SurfaceSample { rest_m, outward, area_m2, cell: self.shape.bind(rest_m) });
+            };
+            let parts = parts as u32;
+            for i in 0..parts {
+                for j in 0..parts - i {
+                    let (i, j) = (f64::from(i), f64::from(j));
+                    add(i + 1.0 / 3.0, j + 1.0 / 3.0);
+                    if i + j < f64::from(parts) - 1.5 {
+                        add(i + 2.0 / 3.0, j + 2.0 / 3.0);
+                    }
+                }
+            }
+        }
+        samples
     }
 
     fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2)) {

@@ -53,6 +53,13 @@ impl MeshDisc {
     }
 }
 
+impl MeshDisc {
+    /// Returns the corners of the triangles around the place ([`Surface::triangles_around`](palpate_geometry::surface::Surface)).
+    pub(crate) fn triangles_around(&self, reach_m: f64) -> Vec<[DVec3; 3]> {
+        self.shape.surface().triangles_around(&self.place, reach_m)
+    }
+}
+
 impl TissueDisc for MeshDisc {
     fn boxed(&self) -> Box<dyn TissueDisc> {
         Box::new(self.clone())

@@ -238,8 +238,13 @@ impl SolidShape {
 
     /// Returns the part of each cube that counts for stiffness and mass; 0 for a cube outside.
     pub(super) fn counted_parts(&self) -> Vec<f64> {
-        let counted = |part: &f32| if *part > 0.0 { f64::from(*part).max(MIN_PART) } else { 0.0 };
-        self.parts.iter().map(counted).collect()
+        (0..self.parts.len()).map(|cell| self.counted_part(cell)).collect()
+    }
+
+    /// Returns the part of a cube that counts.
+    pub(super) fn counted_part(&self, cell: usize) -> f64 {
+        let part = self.parts[cell];
+        if part > 0.0 { f64::from(part).max(MIN_PART) } else { 0.0 }
     }
 
     /// Returns the surface, with edges about as short as those of a cube: frames show it, and tools touch it.
@@ -342,7 +347,7 @@ impl SolidShape {
 
     /// Returns the points at the corners of the cube around a place and their trilinear weights. For a place in no cube
     /// of the solid, it is the nearest cube of the solid, and the place is moved to it.
-    fn bind(&self, place_m: DVec3) -> CellPlace {
+    pub(crate) fn bind(&self, place_m: DVec3) -> CellPlace {
         let at = self.lattice.from_m(place_m);
         let mut cell = [0, 1, 2].map(|axis| whole(at[axis]).min(self.lattice.cells[axis] - 1));
         if !self.is_in(cell) {
@@ -600,5 +605,9 @@ impl RestShape for SolidShape {
 
     fn disc_work(&self, radius_m: f64) -> u64 {
         self.surface.disc_work(radius_m)
+    }
+
+    fn takes_rigid_tips(&self) -> bool {
+        true
     }
 }

@@ -39,7 +39,7 @@ pub(crate) fn broken_by_tools<T: Real>(
         })
     };
     let of_tool = |tool: &Tool| -> Option<usize> {
-        let mut points = tool.points().map(|point| model.index_of(point));
+        let mut points = tool.moved_points().map(|point| model.index_of(point));
         if !is_sound(tool) {
             return Some(points.next().unwrap_or(0));
         }

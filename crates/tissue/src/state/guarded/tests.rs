@@ -9,7 +9,7 @@ use crate::scene::{Integrator, Named};
 use crate::scheme::Scheme;
 use crate::shape::PointId;
 use crate::{Push, Tissue};
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::Tip;
 
 /// The names of all schemes.
 fn schemes() -> impl Iterator<Item = &'static str> {
@@ -87,7 +87,7 @@ fn grasps_that_hold_still_beside_each_other_do_nothing() {
     for integrator in schemes() {
         let model = Model::paper(&[&format!("stepping.integrator={integrator}"), "stepping.substeps=7"]);
         let mut sheet = crate::at_rest(&model);
-        let tip = Tip { radius_m: 0.005, friction: 0.2, grasps: true, coupling: Coupling::Constraint };
+        let tip = Tip { grasps: true, ..Tip::default() };
         for tool in 0..16 {
             let (y_m, x_m) = (0.1 * f64::from(tool)).sin_cos();
             sheet.pose(tool as usize, DVec3::new(0.07 + 0.01 * x_m, 0.07 + 0.01 * y_m, -0.004), tip);

@@ -3,8 +3,8 @@
 use super::*;
 use glam::DVec3;
 
+use crate::body::model::displacement_m;
 use crate::scene::profile::Poke;
-use crate::tools::contact::displacement_m;
 use crate::{Energy, Grasp, Model, Push, Tissue};
 use palpate_haptics::{ContactState, Coupling, Tip};
 

@@ -1,0 +1,592 @@
+//! Rigid tips: a flat disc or a sphere to which the surface of the tissue yields, so that its pressure is part of the solution.
+//!
+//! The surface near the tip is divided into samples ([`SurfaceSample`]) of area A. A sample that is by g within the tip is
+//! pushed along d, out of the tip, by p·A with p = s·g: as if the tip had a skin. The skin stands for what happens within a cell,
+//! which cells of edge h can't show: without it a rigid tip of a few cells would be too stiff, by about half a cell more of radius.
+//! So s = [`SKIN`]·E/((1 − ν²)·h), with E that of the cell. Block of 60 × 60 × 30 mm, E = 8 kPa, ν = 0.45, rigid disc of 5 mm,
+//! in the middle of a cell, of an edge and on a corner of cells of 5, 3 and 2.5 mm:
+//!
+//! | skin | N/m (theory: 8.1 % above the 107.4 of an even pressure, 116.0) |
+//! |---|---|
+//! | 3 | 98 to 109 |
+//! | 5 | 110 to 117 |
+//! | 8 | 120 to 125 |
+//! | 100 | 140 to 165 |
+//!
+//! A skin also costs nothing where samples outnumber the points that they move, where a condition for each could not be met. At
+//! the rim of a disc the area of a sample falls to 0, so that it slides without jumps. Which samples it covers depends on its
+//! place at rest, so that the skin has one energy as long as the disc does not slide; sliding takes the change of it.
+//!
+//! The skin of a sphere has a core that no sample enters: with b the thickness above the core, p = s·g/(1 − g/b). A sample that
+//! passed the centre would be pushed out on the wrong side.
+//!
+//! In each substep the tissue first moves under the forces F of the last one; the change of F is an impulse at the substep's
+//! beginning, so that at its end f = s·A·g ≥ 0 holds for all samples at once, however stiff the skin is. Each impulse moves
+//! the neighbours too. The equations are solved by sweeps over the samples, each of which solves its own (projected
+//! Gauss–Seidel); forces of the substep before are the first guess.
+//!
+//! Friction holds a sample to the movement of the tip, by a force across d of at most μ·f.
+//!
+//! A tool that is placed within the tissue, or that jumps into it, comes in along its axis at a bounded speed
+//! ([`MAX_DEEPENING`]). The work of a tool is F·ẋ with x the place that it has then.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use crate::body::disc::SurfaceSample;
+use crate::body::footprint::Footprint;
+use crate::body::model::{Model, Plan, displacement_m};
+use crate::kernel::field::{Layout, State};
+use crate::kernel::real::Real;
+use crate::saved::{Checks, SavedPlace, SavedPressing, ensure};
+use crate::scene::Body;
+use crate::shape::{CellPlace, PointId};
+use palpate_haptics::{ContactState, Tip, TipShape};
+use palpate_refusal::Result;
+
+/// Stiffness of the skin, relative to E/((1 − ν²)·h).
+const SKIN: f64 = 6.0;
+
+/// Thickness of the skin above the core of a sphere, divided by its radius; and the part of it up to which it stiffens.
+const THICKNESS: f64 = 0.6;
+const STIFFENS: f64 = 0.95;
+
+/// Sweeps over the samples in a substep. Forces change little from one substep to the next, so that a few suffice.
+const SWEEPS: usize = 8;
+
+/// Samples are at most this part of the radius apart, and at most a cell.
+const SPACING: f64 = 0.35;
+
+/// Samples are taken as far around the tool as this, times the radius. They are taken anew when it has moved by
+/// [`AROUND`] − [`REACH`] of it. A sphere that lies deep within the tissue has half of its surface in contact.
+const AROUND: f64 = 1.625;
+const REACH: f64 = 1.5;
+
+/// The disc of the tool follows it along the surface when it is so far off, divided by the radius.
+const OFF: f64 = 1.0 / 64.0;
+
+/// A tip goes deeper by at most this part of a cell in a substep, and what it does not follow decreases by as much.
+const MAX_DEEPENING: f64 = 0.05;
+
+/// The cosine between the outward normal of a sample and the direction from which a tip may press it.
+const FACING: f64 = 0.1;
+
+/// A sample whose points can move less than this part of what one free point with all of its weight would is as good as fixed,
+/// and the tip does not feel it.
+const FIXED_PART: f64 = 1e-3;
+
+/// A part of the surface near a tip, and the points that it moves with.
+#[derive(Debug)]
+struct Sample {
+    rest_m: DVec3,
+    outward: DVec3,
+    /// s·A of the whole sample, N/m.
+    stiffness_n_per_m: f64,
+    /// Its points in [`RigidTip::nodes`], with their weights.
+    nodes: [u16; 8],
+    weights: [f64; 8],
+    /// Σ w²/mass over its movable points.
+    relative_inverse_mass: f64,
+}
+
+/// A point that samples move with.
+#[derive(Debug, Clone, Copy)]
+struct TouchedPoint {
+    point: [usize; 2],
+    place: usize,
+    /// 1/mass, relative to the reference mass; 0 if it is fixed.
+    inverse_mass: f64,
+}
+
+/// A sample that the tip touches in a substep.
+#[derive(Debug, Clone, Copy)]
+struct Touched {
+    sample: usize,
+    /// Unit vector out of the tip.
+    way: DVec3,
+    /// Depth within the tip before the impulses, m, beyond that at which a skin of this stiffness would press with nothing.
+    deep_m: f64,
+    /// Movement along the surface relative to the tip before the impulses, m.
+    slip_m: DVec3,
+    /// Change of the force with the depth, N/m.
+    stiffness_n_per_m: f64,
+}
+
+/// What a tip did in a substep.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct TipPress {
+    /// Force on the tissue, N.
+    pub(crate) force_n: DVec3,
+    /// Movement of the place that the tip had, m.
+    pub(crate) moved_m: DVec3,
+    pub(crate) contact_state: Option<ContactState>,
+}
+
+/// How the tip of a tool presses.
+#[derive(Debug, Clone)]
+pub(crate) struct RigidTip {
+    tip: Tip,
+    samples: Arc<[Sample]>,
+    nodes: Arc<[TouchedPoint]>,
+    /// Where the samples were taken: the place, and its rest position, m.
+    around: Option<(SavedPlace, DVec3)>,
+    /// s·A of each sample where the tip is, N/m, and the rest position of that place, m; `None` after samples were taken.
+    stiffness_n_per_m: Vec<f64>,
+    covered_m: Option<DVec3>,
+    /// Unit vector along which the tool met the tissue, out of the tissue.
+    axis: DVec3,
+    /// By how much the tip is behind the tool along the axis, m.
+    drawn_back_m: f64,
+    /// Force on each sample at the end of the last substep, N.
+    forces_n: Vec<DVec3>,
+    /// Energy of the skin, J.
+    stored_j: f64,
+    /// Σ w·F at each point, N: it goes on in the next substep.
+    steady_n: Vec<DVec3>,
+    /// Σ w·ΔF/mass at each point, N, for the masses relative to the reference mass.
+    change_n: Vec<DVec3>,
+    /// Displacement of each point, m; kept, so that a step allocates nothing.
+    displacements_m: Vec<DVec3>,
+    touched: Vec<Touched>,
+}
+
+impl RigidTip {
+    pub(crate) fn new(tip: Tip) -> Self {
+        RigidTip {
+            tip,
+            samples: Arc::default(),
+            nodes: Arc::default(),
+            around: None,
+            stiffness_n_per_m: Vec::new(),
+            covered_m: None,
+            axis: DVec3::Z,
+            drawn_back_m: 0.0,
+            forces_n: Vec::new(),
+            stored_j: 0.0,
+            steady_n: Vec::new(),
+            change_n: Vec::new(),
+            displacements_m: Vec::new(),
+            touched: Vec::new(),
+        }
+    }
+
+    pub(crate) fn saved(&self) -> Option<SavedPressing> {
+        let (around, _) = self.around?;
+        let numbered = self.forces_n.iter().zip(0..).filter(|(force_n, _)| **force_n != DVec3::ZERO);
+        Some(SavedPressing {
+            around,
+            axis: self.axis.into(),
+            drawn_back_m: self.drawn_back_m,
+            stored_j: self.stored_j,
+            forces_n: numbered.map(|(force_n, number)| (number, (*force_n).into())).collect(),
+        })
+    }
+
+    /// Restores a tip whose disc is `footprint`.
+    pub(crate) fn restored(
+        saved: Option<&SavedPressing>,
+        tip: Tip,
+        footprint: &Footprint,
+        model: &Model,
+        checks: &Checks<'_>,
+    ) -> Result<Self> {
+        let mut restored = Self::new(tip);
+        let Some(saved) = saved else { return Ok(restored) };
+        restored.take_samples(model, &Footprint::restored(model, tip.radius_m, &saved.around)?);
+        restored.axis = checks.vector(saved.axis)?;
+        ensure((restored.axis.length() - 1.0).abs() < 1e-6, "a tool whose axis has no direction")?;
+        let is_length = |length: f64| (0.0..1e3).contains(&length);
+        ensure(is_length(saved.drawn_back_m) && is_length(saved.stored_j), "a tool that is drawn back by no length")?;
+        (restored.drawn_back_m, restored.stored_j) = (saved.drawn_back_m, saved.stored_j);
+        for (number, force_n) in &saved.forces_n {
+            let force_n = checks.vector(*force_n)?;
+            let of_sample = restored.forces_n.get_mut(*number as usize);
+            ensure(of_sample.is_some(), "a force on a part of the surface that the tissue lacks")?;
+            of_sample.into_iter().for_each(|of_sample| *of_sample = force_n);
+        }
+        restored.cover(model, footprint);
+        restored.spread();
+        Ok(restored)
+    }
+
+    /// Returns whether the tip pressed in the last substep.
+    pub(crate) fn is_pressing(&self) -> bool {
+        self.forces_n.iter().any(|force_n| *force_n != DVec3::ZERO)
+    }
+
+    /// Changes the friction of the tip.
+    pub(crate) fn set_friction(&mut self, friction: f64) {
+        self.tip.friction = friction;
+    }
+
+    /// Returns the energy of the skin, J.
+    pub(crate) fn stored_j(&self) -> f64 {
+        self.stored_j
+    }
+
+    /// Returns the points that the tip may move.
+    pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
+        self.nodes.iter().map(|node| node.point)
+    }
+
+    /// Returns the continuing force on a point, N.
+    pub(crate) fn steady_on(&self, place: usize) -> DVec3 {
+        let found = self.nodes.binary_search_by_key(&place, |node| node.place);
+        found.map_or(DVec3::ZERO, |node| self.steady_n[node])
+    }
+
+    /// Lets the force of the last substep act during this one.
+    pub(crate) fn go_on<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &mut State<T>, sign: f64) {
+        let forces = self.nodes.iter().zip(&self.steady_n).map(|(node, force_n)| (node, node.inverse_mass * *force_n));
+        push(forces, sign * plan.force_scale(&model.scene), plan.scheme.constant(), layout, state);
+    }
+
+    /// Applies the impulses that [`RigidTip::press`] found.
+    pub(crate) fn kick<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &mut State<T>) {
+        let changes = self.nodes.iter().zip(self.change_n.iter().copied());
+        push(changes, plan.force_scale(&model.scene), plan.scheme.kick(), layout, state);
+    }
+
+    /// Returns the points that impulses and steady forces move by more than `far` spacings.
+    pub(crate) fn moved(&self, model: &Model, plan: &Plan, far: f64) -> impl Iterator<Item = [usize; 2]> {
+        let (scale, kick, constant) = (plan.force_scale(&model.scene), plan.scheme.kick(), plan.scheme.constant());
+        let all = self.nodes.iter().zip(&self.change_n).zip(&self.steady_n);
+        let moves = move |c: usize, node: &TouchedPoint, change_n: DVec3, steady_n: DVec3| {
+            scale * (kick[c] * change_n + constant[c] * node.inverse_mass * steady_n).abs().max_element()
+        };
+        all.filter(move |((node, change_n), steady_n)| {
+            moves(0, node, **change_n, **steady_n).max(moves(1, node, **change_n, **steady_n)) > far
+        })
+        .map(|((node, _), _)| node.point)
+    }
+
+    /// Returns the points that an impulse moves, with that movement in spacings.
+    pub(crate) fn movements(&self, model: &Model, plan: &Plan) -> impl Iterator<Item = ([usize; 2], DVec3)> {
+        let of = plan.force_scale(&model.scene) * plan.scheme.kick()[0];
+        self.nodes.iter().zip(&self.change_n).map(move |(node, change_n)| (node.point, of * *change_n))
+    }
+
+    /// Takes samples around a disc's place, if those that it has are of another part of the surface.
+    fn take_samples_near(&mut self, model: &Model, footprint: &Footprint) {
+        let far_m = (AROUND - REACH) * self.tip.radius_m;
+        let anchor_m = footprint.anchor_m();
+        if self.around.is_none_or(|(_, around_m)| around_m.distance(anchor_m) > far_m) {
+            self.take_samples(model, footprint);
+        }
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn take_samples(&mut self, model: &Model, footprint: &Footprint) {
+        let Tip { radius_m, .. } = self.tip;
+        let taken = footprint.samples(AROUND * radius_m, spacing_m(radius_m, model.unit_m));
+        let place_of = |point: &u32| model.place_of(PointId::new(*point as usize));
+        let mut places: Vec<usize> = taken.iter().flat_map(|sample| sample.cell.points.iter().map(place_of)).collect();
+        places.sort_unstable();
+        places.dedup();
+        places.truncate(usize::from(u16::MAX));
+        let node = |place: usize| {
+            let is_fixed = model.fixed.binary_search(&place).is_ok();
+            let inverse_mass = if is_fixed { 0.0 } else { model.relative_mass_at(place).recip() };
+            TouchedPoint { point: model.point_of(place), place, inverse_mass }
+        };
+        let nodes: Arc<[TouchedPoint]> = places.iter().map(|place| node(*place)).collect();
+        let sample = |sample: &SurfaceSample| {
+            let numbers = sample.cell.points.map(|point| places.binary_search(&place_of(&point)).ok());
+            if numbers.iter().any(Option::is_none) {
+                return None;
+            }
+            let numbers = numbers.map(|number| number.unwrap_or(0) as u16);
+            let weights = sample.cell.weights;
+            let parts = numbers
+                .iter()
+                .zip(&weights)
+                .map(|(node, weight)| weight * weight * nodes[usize::from(*node)].inverse_mass);
+            Some(Sample {
+                rest_m: sample.rest_m,
+                outward: sample.outward,
+                stiffness_n_per_m: skin_n_per_m3(model, &sample.cell) * sample.area_m2,
+                nodes: numbers,
+                weights,
+                relative_inverse_mass: parts.sum(),
+            })
+        };
+        let samples: Arc<[Sample]> = taken.iter().filter_map(sample).collect();
+        // Forces stay with the parts of the surface that they act on.
+        let mut forces_n = vec![DVec3::ZERO; samples.len()];
+        let mut stiffness_n_per_m = vec![0.0; samples.len()];
+        let before = self.forces_n.iter().enumerate().filter(|(_, force_n)| **force_n != DVec3::ZERO);
+        for (old, force_n) in before {
+            let Sample { rest_m, outward, .. } = self.samples[old];
+            let same = samples.iter().position(|sample| sample.rest_m == rest_m && sample.outward == outward);
+            if let Some(number) = same {
+                (forces_n[number], stiffness_n_per_m[number]) = (*force_n, self.stiffness_n_per_m[old]);
+            }
+        }
+        self.around = Some((footprint.saved(), footprint.anchor_m()));
+        self.covered_m = None;
+        (self.samples, self.nodes, self.forces_n, self.stiffness_n_per_m) =
+            (samples, nodes, forces_n, stiffness_n_per_m);
+        self.spread();
+    }
+
+    /// Spreads the forces on samples over the points.
+    fn spread(&mut self) {
+        self.steady_n.clear();
+        self.steady_n.resize(self.nodes.len(), DVec3::ZERO);
+        for (sample, force_n) in self.samples.iter().zip(&self.forces_n).filter(|(_, force_n)| **force_n != DVec3::ZERO)
+        {
+            for (node, weight) in sample.nodes.iter().zip(sample.weights) {
+                self.steady_n[usize::from(*node)] += weight * *force_n;
+            }
+        }
+    }
+
+    /// Lets the tip be where `footprint` is, on a surface whose normal there is `outward`: it meets the tissue along this.
+    /// Returns the energy that the skin takes because other samples are under the tip, J.
+    pub(crate) fn follow(&mut self, model: &Model, footprint: &Footprint, outward: DVec3) -> f64 {
+        self.take_samples_near(model, footprint);
+        if !self.is_pressing() {
+            self.axis = outward;
+        }
+        self.cover(model, footprint)
+    }
+
+    /// Lets the skin cover what is under a disc. Returns the energy that it takes, J.
+    fn cover(&mut self, model: &Model, footprint: &Footprint) -> f64 {
+        if self.covered_m == Some(footprint.anchor_m()) {
+            return 0.0;
+        }
+        self.covered_m = Some(footprint.anchor_m());
+        let mut gained_j = 0.0;
+        let (anchor_m, rest_outward) = (footprint.anchor_m(), footprint.at_rest().1);
+        for (number, sample) in self.samples.iter().enumerate() {
+            let now = sample.stiffness_n_per_m * self.part_under(sample, anchor_m, rest_outward, model.unit_m);
+            let before = std::mem::replace(&mut self.stiffness_n_per_m[number], now);
+            if before > 0.0 {
+                gained_j += 0.5 * (now - before) * (self.forces_n[number].length() / before).powi(2);
+            }
+        }
+        gained_j
+    }
+
+    /// Returns the part of a sample that is under the tip.
+    fn part_under(&self, sample: &Sample, anchor_m: DVec3, outward: DVec3, edge_m: f64) -> f64 {
+        let Tip { shape, radius_m, .. } = self.tip;
+        if shape == TipShape::Sphere {
+            return 1.0;
+        }
+        let from_m = sample.rest_m - anchor_m;
+        let across_m = (from_m - from_m.dot(outward) * outward).length();
+        ((radius_m - across_m) / spacing_m(radius_m, edge_m) + 0.5).clamp(0.0, 1.0)
+    }
+
+    /// Returns how far the disc of a tool is from it along the surface where it must follow, m.
+    pub(crate) fn off_m(&self, gap_m: DVec3, outward: DVec3) -> Option<DVec3> {
+        let beside_m = gap_m - gap_m.dot(outward) * outward;
+        (beside_m.length() > OFF * self.tip.radius_m).then_some(beside_m)
+    }
+
+    /// Returns whether a tip is too far from the surface to touch it: `gap_m` is the vector from the surface to the tool.
+    pub(crate) fn is_far(&self, gap_m: DVec3) -> bool {
+        gap_m.length() > (1.0 + AROUND) * self.tip.radius_m
+    }
+
+    /// Finds the impulses under which the tissue is where the tip lets it be at the end of a substep, for a tool that is at
+    /// `place_m` then and moves by `own_m` in the substep. `state` includes the effect of the force of the last substep.
+    pub(crate) fn press<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &State<T>,
+        [place_m, own_m]: [DVec3; 2],
+    ) -> TipPress {
+        let deeper_m = MAX_DEEPENING * model.unit_m;
+        let before_m = self.drawn_back_m;
+        self.drawn_back_m = (self.drawn_back_m - deeper_m).max(0.0);
+        let moved_m = |tip: &Self| own_m + (tip.drawn_back_m - before_m) * tip.axis;
+        self.find_touched(model, layout, state, place_m + self.drawn_back_m * self.axis, moved_m(self));
+        let too_deep_m = |tip: &Self| {
+            let over = tip.touched.iter().filter(|touched| touched.stiffness_n_per_m > 0.0).map(|touched| {
+                let pressed_n = tip.forces_n[touched.sample].dot(touched.way).max(0.0);
+                touched.deep_m - pressed_n / touched.stiffness_n_per_m - 2.0 * deeper_m
+            });
+            over.fold(0.0, f64::max)
+        };
+        let over_m = too_deep_m(self);
+        if over_m > 0.0 {
+            self.drawn_back_m += over_m;
+            self.find_touched(model, layout, state, place_m + self.drawn_back_m * self.axis, moved_m(self));
+            // Where the axis is not the way out of the tip, some are still too deep.
+            for touched in &mut self.touched {
+                let pressed_n = self.forces_n[touched.sample].dot(touched.way).max(0.0);
+                let most_m = pressed_n / touched.stiffness_n_per_m.max(f64::MIN_POSITIVE) + 4.0 * deeper_m;
+                touched.deep_m = touched.deep_m.min(most_m);
+            }
+        }
+        let slides = self.solve(model, plan);
+        let mut pressed = TipPress { moved_m: moved_m(self), ..TipPress::default() };
+        self.stored_j = 0.0;
+        let mut is_pressing = false;
+        for touched in &self.touched {
+            let force_n = self.forces_n[touched.sample];
+            pressed.force_n += force_n;
+            is_pressing |= force_n != DVec3::ZERO;
+            let stiffness = self.stiffness_n_per_m[touched.sample];
+            if stiffness > 0.0 {
+                self.stored_j += stored_j(stiffness, force_n.dot(touched.way), thickness_m(&self.tip));
+            }
+        }
+        if is_pressing {
+            pressed.contact_state = Some(if slides { ContactState::Sliding } else { ContactState::Sticking });
+        } else {
+            self.drawn_back_m = 0.0;
+        }
+        self.spread();
+        pressed
+    }
+
+    /// Finds the samples within the tip, and those that it pressed before.
+    fn find_touched<T: Real>(
+        &mut self,
+        model: &Model,
+        layout: &Layout,
+        state: &State<T>,
+        place_m: DVec3,
+        own_m: DVec3,
+    ) {
+        let Tip { shape, radius_m, .. } = self.tip;
+        let RigidTip { samples, nodes, axis, .. } = self;
+        let (axis, thickness_m) = (*axis, thickness_m(&self.tip));
+        self.displacements_m.clear();
+        self.displacements_m.extend(nodes.iter().map(|node| displacement_m(model, layout, state, node.point)));
+        self.touched.clear();
+        for (number, sample) in samples.iter().enumerate() {
+            let force_n = self.forces_n[number];
+            let parts = || sample.nodes.iter().map(|node| usize::from(*node)).zip(sample.weights);
+            let moved_m = parts().fold(DVec3::ZERO, |sum, (node, weight)| sum + weight * self.displacements_m[node]);
+            let from_m = sample.rest_m + moved_m - place_m;
+            let (way, deep_m) = match shape {
+                TipShape::Sphere => (from_m.try_normalize().unwrap_or(-axis), radius_m - from_m.length()),
+                TipShape::RigidDisc | TipShape::Disc => (-axis, from_m.dot(axis)),
+            };
+            let faces = way.dot(sample.outward) < -FACING && sample.relative_inverse_mass > FIXED_PART;
+            let stiffness_n_per_m = if faces { self.stiffness_n_per_m[number] } else { 0.0 };
+            let touches = stiffness_n_per_m > 0.0 && deep_m > 0.0 && deep_m < 2.0 * radius_m;
+            if !touches && force_n == DVec3::ZERO {
+                continue;
+            }
+            let movement = |node: usize| {
+                let [i, j] = nodes[node].point;
+                let at = i * layout.stride + j;
+                DVec3::from_array([0, 1, 2].map(|c| state.d[c * layout.plane + at].wide()))
+            };
+            let moves = parts().fold(DVec3::ZERO, |sum, (node, weight)| sum + weight * movement(node));
+            let slip_m = model.unit_m * moves - own_m;
+            // The tangent of the skin's law.
+            let part = (deep_m / thickness_m).clamp(0.0, STIFFENS);
+            let stiffness_n_per_m = stiffness_n_per_m / (1.0 - part).powi(2);
+            let deep_m = if touches { deep_m - part * part * thickness_m } else { deep_m.min(0.0) };
+            self.touched.push(Touched {
+                sample: number,
+                way,
+                deep_m,
+                slip_m: slip_m - slip_m.dot(way) * way,
+                stiffness_n_per_m,
+            });
+        }
+    }
+
+    /// Solves for the forces at the end of the substep, by sweeps over the samples. Returns whether friction holds less than half
+    /// of the pressure.
+    fn solve(&mut self, model: &Model, plan: &Plan) -> bool {
+        let RigidTip { samples, nodes, touched, forces_n, change_n, .. } = self;
+        let [of_u, of_d] = plan.scheme.kick().map(|of| of * plan.force_scale(&model.scene) * model.unit_m);
+        let friction = self.tip.friction;
+        change_n.clear();
+        change_n.resize(nodes.len(), DVec3::ZERO);
+        let (mut held_n, mut sliding_n) = (0.0, 0.0);
+        for _ in 0..SWEEPS {
+            (held_n, sliding_n) = (0.0, 0.0);
+            for at in touched.iter() {
+                let sample = &samples[at.sample];
+                let parts = || sample.nodes.iter().map(|node| usize::from(*node)).zip(sample.weights);
+                let moved_n: DVec3 = parts().map(|(node, weight)| weight * change_n[node]).sum();
+                let now_n = forces_n[at.sample];
+                let (pressed_n, stiffness) = (now_n.dot(at.way), at.stiffness_n_per_m);
+                let deep_m = at.deep_m - of_u * moved_n.dot(at.way);
+                let gives = stiffness * of_u * sample.relative_inverse_mass;
+                let pressing_n = (pressed_n + (stiffness * deep_m - pressed_n) / (1.0 + gives)).max(0.0);
+                let mut across_n = now_n - pressed_n * at.way;
+                if friction > 0.0 && pressing_n > 0.0 {
+                    let slip_m = at.slip_m + of_d * (moved_n - moved_n.dot(at.way) * at.way);
+                    across_n -= slip_m / (of_d * sample.relative_inverse_mass);
+                    let (length_n, most_n) = (across_n.length(), friction * pressing_n);
+                    if length_n > most_n {
+                        across_n *= most_n / length_n;
+                        sliding_n += pressing_n;
+                    } else {
+                        held_n += pressing_n;
+                    }
+                } else {
+                    across_n = DVec3::ZERO;
+                    sliding_n += pressing_n;
+                }
+                let force_n = pressing_n * at.way + across_n;
+                let by_n = force_n - now_n;
+                forces_n[at.sample] = force_n;
+                for (node, weight) in parts() {
+                    change_n[node] += weight * nodes[node].inverse_mass * by_n;
+                }
+            }
+        }
+        sliding_n > held_n
+    }
+}
+
+/// Returns s of the cell around a sample, N/m³.
+fn skin_n_per_m3(model: &Model, cell: &CellPlace) -> f64 {
+    let Body::Solid(solid) = &model.scene.body else { return 0.0 };
+    let nu = solid.material.poissons_ratio;
+    SKIN * solid.modulus_pa(cell) / ((1.0 - nu * nu) * model.unit_m)
+}
+
+/// Returns the thickness of a skin, m; that of a disc has no bound.
+fn thickness_m(tip: &Tip) -> f64 {
+    if tip.shape == TipShape::Sphere { THICKNESS * tip.radius_m } else { 1e3 }
+}
+
+/// Returns the energy of a skin of thickness b that presses with a force f, J: s·A·b²·(−ln(1 − g/b) − g/b), with
+/// f = s·A·g/(1 − g/b).
+fn stored_j(stiffness_n_per_m: f64, force_n: f64, thickness_m: f64) -> f64 {
+    let deep_m = force_n / (stiffness_n_per_m + force_n / thickness_m);
+    let part = deep_m / thickness_m;
+    // Near 0 the difference of the logarithm and its argument is all rounding.
+    let form = if part < 1e-4 { 0.5 * part * part } else { -libm::log1p(-part) - part };
+    stiffness_n_per_m * thickness_m * thickness_m * form
+}
+
+/// Returns how far samples are apart at most, m.
+fn spacing_m(radius_m: f64, edge_m: f64) -> f64 {
+    (SPACING * radius_m).min(edge_m)
+}
+
+/// Adds to u and d of points the effect of forces divided by their masses, with the factors `[of_u, of_d]`.
+fn push<'n, T: Real>(
+    forces: impl Iterator<Item = (&'n TouchedPoint, DVec3)>,
+    scale: f64,
+    [of_u, of_d]: [f64; 2],
+    layout: &Layout,
+    state: &mut State<T>,
+) {
+    for (node, force_n) in forces.filter(|(node, force_n)| node.inverse_mass > 0.0 && *force_n != DVec3::ZERO) {
+        let [i, j] = node.point;
+        for c in 0..3 {
+            let at = c * layout.plane + i * layout.stride + j;
+            let change = scale * force_n[c];
+            state.u[at] += T::of(of_u * change);
+            state.d[at] += T::of(of_d * change);
+        }
+    }
+}
