@@ -70,7 +70,10 @@ class Help(unittest.TestCase):
         for there, arguments in [
             (palpate.run, "(scene, script, *, held=False, audit=False)"),
             (palpate.Session.step, "(self, /, steps=1)"),
-            (palpate.Tip, "(radius_m=0.005, *, friction=0.2, grasps=False, stiffness_n_per_m=None, damping_n_s_per_m=0.0)"),
+            (
+                palpate.Tip,
+                "(radius_m=0.005, *, friction=0.2, grasps=False, stiffness_n_per_m=None, damping_n_s_per_m=0.0, shape='disc')",
+            ),
             (palpate.Client.load, "(self, /, plan, *, report=None)"),
         ]:
             self.assertEqual(str(inspect.signature(there)), arguments)

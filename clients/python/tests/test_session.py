@@ -147,6 +147,22 @@ class Sessions(unittest.TestCase):
             one.step(20)
         self.assertEqual(again.hash, session.hash)
 
+    def test_a_sphere_presses_a_solid_from_a_radius_above_it(self):
+        session, tip = palpate.Session("phantom"), palpate.Tip(0.005, shape="sphere")
+        self.assertEqual((tip.shape, repr(tip)), ("sphere", "Tip(0.005, friction=0.2, grasps=False, shape=\"sphere\")"))
+        # Its top is at 40 mm.
+        for step in range(100):
+            session.pose(0, (0, 0, 0.0455 - 2e-5 * step), tip)
+            session.step()
+            if step == 20:
+                self.assertEqual(session.tool(0).force_on_tool_n[2], 0.0)
+        self.assertGreater(session.tool(0).force_on_tool_n[2], 0.05)
+        with self.assertRaisesRegex(ValueError, "shape: must be one of disc, rigid, sphere"):
+            palpate.Tip(shape="cube")
+        with self.assertRaises(palpate.Refused) as raised:
+            palpate.Session("paper").pose(0, (0.2, 0.2, 0.0), tip)
+        self.assertEqual(raised.exception.field, "pose.tip.shape")
+
     def test_a_zero_has_no_sign(self):
         hashes = []
         for zero in (0.0, -0.0):

@@ -275,7 +275,7 @@ pub(crate) struct SavedPressing {
     pub(crate) around: SavedPlace,
     pub(crate) axis: Vector,
     pub(crate) drawn_back_m: f64,
-    /// Energy of the tip's skin, J.
+    /// Energy of the contact, J.
     pub(crate) stored_j: f64,
     pub(crate) forces_n: Vec<(u32, Vector)>,
 }

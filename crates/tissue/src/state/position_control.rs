@@ -151,7 +151,7 @@ impl Tool {
             return rigid;
         }
         work.add(rigid.follow(model, &self.footprint, outward));
-        rigid.go_on(model, plan, layout, state, 1.0);
+        rigid.go_on(model, plan, layout, state);
         let pressed = rigid.press(model, plan, layout, state, [place_m, self.own_movement_m(model, plan)]);
         rigid.kick(model, plan, layout, state);
         if was_pressing || pressed.contact_state.is_some() {

@@ -603,7 +603,7 @@ impl Tool {
         *gap_m += (kept_m - offset_m) * mean;
     }
 
-    /// Returns whether a spring, or the skin of a rigid tip, couples the tool to the tissue at present.
+    /// Returns whether a spring, or the contact of a rigid tip, couples the tool to the tissue at present.
     pub(crate) fn is_coupled(&self) -> bool {
         self.rigid.is_some()
             || self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })

@@ -1,27 +1,27 @@
 //! Rigid tips: a flat disc or a sphere to which the surface of the tissue yields, so that its pressure is part of the solution.
 //!
 //! The surface near the tip is divided into samples ([`SurfaceSample`]) of area A. A sample that is by g within the tip is
-//! pushed along d, out of the tip, by p·A with p = s·g: as if the tip had a skin. The skin stands for what happens within a cell,
-//! which cells of edge h can't show: without it a rigid tip of a few cells would be too stiff, by about half a cell more of radius.
-//! So s = [`SKIN`]·E/((1 − ν²)·h), with E that of the cell. Block of 60 × 60 × 30 mm, E = 8 kPa, ν = 0.45, rigid disc of 5 mm,
+//! pushed along d, out of the tip, by p·A with p = s·g. The contact stiffness s stands for what happens within a cell, which cells
+//! of edge h can't show: with none of it a rigid tip of a few cells would be too stiff, by about half a cell more of radius. So
+//! s = [`CONTACT_STIFFNESS`]·E/((1 − ν²)·h), with E that of the cell. Block of 60 × 60 × 30 mm, E = 8 kPa, ν = 0.45, rigid disc of 5 mm,
 //! in the middle of a cell, of an edge and on a corner of cells of 5, 3 and 2.5 mm:
 //!
-//! | skin | N/m (theory: 8.1 % above the 107.4 of an even pressure, 116.0) |
+//! | s·(1 − ν²)·h/E | N/m (theory: 8.1 % above the 107.4 of an even pressure, 116.0) |
 //! |---|---|
 //! | 3 | 98 to 109 |
 //! | 5 | 110 to 117 |
 //! | 8 | 120 to 125 |
 //! | 100 | 140 to 165 |
 //!
-//! A skin also costs nothing where samples outnumber the points that they move, where a condition for each could not be met. At
-//! the rim of a disc the area of a sample falls to 0, so that it slides without jumps. Which samples it covers depends on its
-//! place at rest, so that the skin has one energy as long as the disc does not slide; sliding takes the change of it.
+//! So samples may outnumber the points that they move: a condition for each could not be met. At the rim of a disc the area of a
+//! sample falls to 0, so that it slides without jumps. Which samples it covers depends on its place at rest, so that the contact
+//! has one energy as long as the disc does not slide; sliding takes the change of it.
 //!
-//! The skin of a sphere has a core that no sample enters: with b the thickness above the core, p = s·g/(1 − g/b). A sample that
+//! A sphere has a core that no sample enters: with b the distance from its surface to the core, p = s·g/(1 − g/b). A sample that
 //! passed the centre would be pushed out on the wrong side.
 //!
 //! In each substep the tissue first moves under the forces F of the last one; the change of F is an impulse at the substep's
-//! beginning, so that at its end f = s·A·g ≥ 0 holds for all samples at once, however stiff the skin is. Each impulse moves
+//! beginning, so that at its end f = s·A·g ≥ 0 holds for all samples at once, however large s is. Each impulse moves
 //! the neighbours too. The equations are solved by sweeps over the samples, each of which solves its own (projected
 //! Gauss–Seidel); forces of the substep before are the first guess.
 //!
@@ -45,12 +45,12 @@ use crate::shape::{CellPlace, PointId};
 use palpate_haptics::{ContactState, Tip, TipShape};
 use palpate_refusal::Result;
 
-/// Stiffness of the skin, relative to E/((1 − ν²)·h).
-const SKIN: f64 = 6.0;
+/// The contact stiffness s, relative to E/((1 − ν²)·h).
+const CONTACT_STIFFNESS: f64 = 6.0;
 
-/// Thickness of the skin above the core of a sphere, divided by its radius; and the part of it up to which it stiffens.
-const THICKNESS: f64 = 0.6;
-const STIFFENS: f64 = 0.95;
+/// Distance b from the surface of a sphere to its core, divided by its radius; and the part of it up to which s grows.
+const TO_CORE: f64 = 0.6;
+const LARGEST_PART: f64 = 0.95;
 
 /// Sweeps over the samples in a substep. Forces change little from one substep to the next, so that a few suffice.
 const SWEEPS: usize = 8;
@@ -58,10 +58,10 @@ const SWEEPS: usize = 8;
 /// Samples are at most this part of the radius apart, and at most a cell.
 const SPACING: f64 = 0.35;
 
-/// Samples are taken as far around the tool as this, times the radius. They are taken anew when it has moved by
-/// [`AROUND`] − [`REACH`] of it. A sphere that lies deep within the tissue has half of its surface in contact.
+/// Samples are taken as far around the tool as this, times the radius: half of the surface of a sphere that is deep within the
+/// tissue touches it. They are taken anew when the tool has moved by the second.
 const AROUND: f64 = 1.625;
-const REACH: f64 = 1.5;
+const TAKEN_ANEW: f64 = 0.125;
 
 /// The disc of the tool follows it along the surface when it is so far off, divided by the radius.
 const OFF: f64 = 1.0 / 64.0;
@@ -105,7 +105,7 @@ struct Touched {
     sample: usize,
     /// Unit vector out of the tip.
     way: DVec3,
-    /// Depth within the tip before the impulses, m, beyond that at which a skin of this stiffness would press with nothing.
+    /// Depth within the tip before the impulses, m, beyond that at which the tangent of the law is 0.
     deep_m: f64,
     /// Movement along the surface relative to the tip before the impulses, m.
     slip_m: DVec3,
@@ -140,7 +140,7 @@ pub(crate) struct RigidTip {
     drawn_back_m: f64,
     /// Force on each sample at the end of the last substep, N.
     forces_n: Vec<DVec3>,
-    /// Energy of the skin, J.
+    /// Energy of the contact, J.
     stored_j: f64,
     /// Σ w·F at each point, N: it goes on in the next substep.
     steady_n: Vec<DVec3>,
@@ -220,7 +220,7 @@ impl RigidTip {
         self.tip.friction = friction;
     }
 
-    /// Returns the energy of the skin, J.
+    /// Returns the energy of the contact, J.
     pub(crate) fn stored_j(&self) -> f64 {
         self.stored_j
     }
@@ -237,9 +237,9 @@ impl RigidTip {
     }
 
     /// Lets the force of the last substep act during this one.
-    pub(crate) fn go_on<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &mut State<T>, sign: f64) {
+    pub(crate) fn go_on<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &mut State<T>) {
         let forces = self.nodes.iter().zip(&self.steady_n).map(|(node, force_n)| (node, node.inverse_mass * *force_n));
-        push(forces, sign * plan.force_scale(&model.scene), plan.scheme.constant(), layout, state);
+        push(forces, plan.force_scale(&model.scene), plan.scheme.constant(), layout, state);
     }
 
     /// Applies the impulses that [`RigidTip::press`] found.
@@ -269,7 +269,7 @@ impl RigidTip {
 
     /// Takes samples around a disc's place, if those that it has are of another part of the surface.
     fn take_samples_near(&mut self, model: &Model, footprint: &Footprint) {
-        let far_m = (AROUND - REACH) * self.tip.radius_m;
+        let far_m = TAKEN_ANEW * self.tip.radius_m;
         let anchor_m = footprint.anchor_m();
         if self.around.is_none_or(|(_, around_m)| around_m.distance(anchor_m) > far_m) {
             self.take_samples(model, footprint);
@@ -305,7 +305,7 @@ impl RigidTip {
             Some(Sample {
                 rest_m: sample.rest_m,
                 outward: sample.outward,
-                stiffness_n_per_m: skin_n_per_m3(model, &sample.cell) * sample.area_m2,
+                stiffness_n_per_m: contact_n_per_m3(model, &sample.cell) * sample.area_m2,
                 nodes: numbers,
                 weights,
                 relative_inverse_mass: parts.sum(),
@@ -343,7 +343,7 @@ impl RigidTip {
     }
 
     /// Lets the tip be where `footprint` is, on a surface whose normal there is `outward`: it meets the tissue along this.
-    /// Returns the energy that the skin takes because other samples are under the tip, J.
+    /// Returns the energy that the contact takes because other samples are under the tip, J.
     pub(crate) fn follow(&mut self, model: &Model, footprint: &Footprint, outward: DVec3) -> f64 {
         self.take_samples_near(model, footprint);
         if !self.is_pressing() {
@@ -352,7 +352,7 @@ impl RigidTip {
         self.cover(model, footprint)
     }
 
-    /// Lets the skin cover what is under a disc. Returns the energy that it takes, J.
+    /// Lets the tip cover what is under a disc. Returns the energy that the contact takes, J.
     fn cover(&mut self, model: &Model, footprint: &Footprint) -> f64 {
         if self.covered_m == Some(footprint.anchor_m()) {
             return 0.0;
@@ -435,7 +435,7 @@ impl RigidTip {
             is_pressing |= force_n != DVec3::ZERO;
             let stiffness = self.stiffness_n_per_m[touched.sample];
             if stiffness > 0.0 {
-                self.stored_j += stored_j(stiffness, force_n.dot(touched.way), thickness_m(&self.tip));
+                self.stored_j += stored_j(stiffness, force_n.dot(touched.way), to_core_m(&self.tip));
             }
         }
         if is_pressing {
@@ -458,7 +458,7 @@ impl RigidTip {
     ) {
         let Tip { shape, radius_m, .. } = self.tip;
         let RigidTip { samples, nodes, axis, .. } = self;
-        let (axis, thickness_m) = (*axis, thickness_m(&self.tip));
+        let (axis, to_core_m) = (*axis, to_core_m(&self.tip));
         self.displacements_m.clear();
         self.displacements_m.extend(nodes.iter().map(|node| displacement_m(model, layout, state, node.point)));
         self.touched.clear();
@@ -484,10 +484,10 @@ impl RigidTip {
             };
             let moves = parts().fold(DVec3::ZERO, |sum, (node, weight)| sum + weight * movement(node));
             let slip_m = model.unit_m * moves - own_m;
-            // The tangent of the skin's law.
-            let part = (deep_m / thickness_m).clamp(0.0, STIFFENS);
+            // The tangent of the law.
+            let part = (deep_m / to_core_m).clamp(0.0, LARGEST_PART);
             let stiffness_n_per_m = stiffness_n_per_m / (1.0 - part).powi(2);
-            let deep_m = if touches { deep_m - part * part * thickness_m } else { deep_m.min(0.0) };
+            let deep_m = if touches { deep_m - part * part * to_core_m } else { deep_m.min(0.0) };
             self.touched.push(Touched {
                 sample: number,
                 way,
@@ -546,25 +546,25 @@ impl RigidTip {
 }
 
 /// Returns s of the cell around a sample, N/m³.
-fn skin_n_per_m3(model: &Model, cell: &CellPlace) -> f64 {
+fn contact_n_per_m3(model: &Model, cell: &CellPlace) -> f64 {
     let Body::Solid(solid) = &model.scene.body else { return 0.0 };
     let nu = solid.material.poissons_ratio;
-    SKIN * solid.modulus_pa(cell) / ((1.0 - nu * nu) * model.unit_m)
+    CONTACT_STIFFNESS * solid.modulus_pa(cell) / ((1.0 - nu * nu) * model.unit_m)
 }
 
-/// Returns the thickness of a skin, m; that of a disc has no bound.
-fn thickness_m(tip: &Tip) -> f64 {
-    if tip.shape == TipShape::Sphere { THICKNESS * tip.radius_m } else { 1e3 }
+/// Returns the distance b from the surface of a tip to its core, m; a disc has none.
+fn to_core_m(tip: &Tip) -> f64 {
+    if tip.shape == TipShape::Sphere { TO_CORE * tip.radius_m } else { 1e3 }
 }
 
-/// Returns the energy of a skin of thickness b that presses with a force f, J: s·A·b²·(−ln(1 − g/b) − g/b), with
+/// Returns the energy of the contact of a sample that is pressed with a force f, J: s·A·b²·(−ln(1 − g/b) − g/b), with
 /// f = s·A·g/(1 − g/b).
-fn stored_j(stiffness_n_per_m: f64, force_n: f64, thickness_m: f64) -> f64 {
-    let deep_m = force_n / (stiffness_n_per_m + force_n / thickness_m);
-    let part = deep_m / thickness_m;
+fn stored_j(stiffness_n_per_m: f64, force_n: f64, to_core_m: f64) -> f64 {
+    let deep_m = force_n / (stiffness_n_per_m + force_n / to_core_m);
+    let part = deep_m / to_core_m;
     // Near 0 the difference of the logarithm and its argument is all rounding.
     let form = if part < 1e-4 { 0.5 * part * part } else { -libm::log1p(-part) - part };
-    stiffness_n_per_m * thickness_m * thickness_m * form
+    stiffness_n_per_m * to_core_m * to_core_m * form
 }
 
 /// Returns how far samples are apart at most, m.
