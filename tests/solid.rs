@@ -11,12 +11,15 @@ use glam::DVec3;
 use palpate_geometry::ReadLimits;
 use palpate_haptics::{ContactState, Tip, TipShape};
 use palpate_refusal::Reason;
+use palpate_session::command::Command;
 use palpate_session::indentation::Indentation;
+use palpate_session::intake::Intake;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::saved::PlainTissue;
 use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{self, Body, CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
 
@@ -271,8 +274,15 @@ fn a_stiffer_tissue_gives_way_less() {
     let (soft, first) = (small("", &[]), small("", &[]).scene.clone());
     let twice = Change { stiffness_n_per_m: Some(2.0 * first.springs.stiffness_n_per_m), ..Change::default() };
     let stiff = soft.changed(&twice, &first, &Limits::default()).unwrap();
-    let [soft, stiff] = [soft, stiff].map(|model| pressed_n_per_m(&mut *at_rest(&model)));
+    let models = [soft, stiff];
+    let [soft, stiff] = models.each_ref().map(|model| pressed_n_per_m(&mut *at_rest(model)));
     assert!((stiff / soft - 2.0).abs() < 0.01, "{soft} {stiff}");
+    let [soft, stiff] = models.map(|model| {
+        let (mut tissue, tip) = (at_rest(&model), Tip { shape: TipShape::RigidDisc, ..Tip::default() });
+        stroked(&mut *tissue, tip, 0..290, &mut |_| {});
+        tissue.tool_contact(0).unwrap().force_on_tool_n.z
+    });
+    assert!((stiff / soft - 2.0).abs() < 0.05, "rigid: {soft} {stiff}");
 }
 
 #[test]
@@ -473,8 +483,26 @@ fn rigid_tips_that_nothing_can_be_are_refused() {
     assert_eq!(refused(&solid.scene, "shape = \"sphere\", grasps = true"), of("shape"));
     let spring = "shape = \"rigid\", spring = { stiffness_n_per_m = 1, damping_n_s_per_m = 0 }";
     assert_eq!(refused(&solid.scene, spring), of("shape"));
+    assert_eq!(refused(&solid.scene, "shape = \"rigid\", radius_m = 0.001"), of("radius_m"));
     let sheet = read(palpate_tissue::scene::PAPER, &[]).unwrap();
     assert_eq!(refused(&sheet, "shape = \"sphere\""), of("shape"));
+    let unknown = palpate_proto::pb::Tip { radius_m: 0.005, shape: 9, ..Default::default() };
+    assert_eq!(palpate_proto::touch::from_tip("pose.tip", Some(&unknown)).unwrap_err().field, "pose.tip.shape");
+}
+
+#[test]
+fn a_tool_keeps_the_shape_of_its_tip_until_it_is_released() {
+    let model = small("", &[]);
+    let mut intake = Intake::new(&model.scene, &Limits::default());
+    intake.acquire(&[0], "test", 1.0, 1, 0).unwrap();
+    let mut pose = |shape| {
+        let tip = Tip { shape, ..Tip::default() };
+        let action = Action::Pose { place_m: DVec3::new(0.03, 0.03, 0.04), velocity_m_per_s: None, tip };
+        intake.submit(1, vec![Command::new(0, None, action)], 0)
+    };
+    pose(TipShape::Disc).unwrap();
+    let refusal = pose(TipShape::Sphere).unwrap_err();
+    assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::OutOfTurn, "pose.tip.shape"), "{refusal}");
 }
 
 /// Doubled and turned triangles, triangles on an edge of two others, and a second block that crosses the first.

@@ -213,7 +213,7 @@ pub fn request(bytes: &[u8]) -> bool {
 fn open(open: &pb::TouchOpen) -> bool {
     let shape = model().shape();
     let device = open.device.as_ref().map(touch::from_device);
-    let tip = touch::from_tip(open.tip.as_ref());
+    let tip = touch::from_tip("tip", open.tip.as_ref()).unwrap_or_default();
     let only = (!open.tools.is_empty()).then(|| open.tools.clone());
     let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
     let sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, open.device.is_some());

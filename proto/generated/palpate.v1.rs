@@ -311,7 +311,7 @@ pub struct Pose {
     /// Offset from the position to the tip, in the tool's own frame.
     #[prost(message, optional, tag = "3")]
     pub tip_offset_m: ::core::option::Option<Vector3>,
-    /// Absent: it touches, with a radius of 5 mm and friction 0.2. The radius can't change until the tool is released
+    /// Absent: it touches, with a radius of 5 mm and friction 0.2. Shape and radius can't change until the tool is released
     /// (OUT_OF_TURN).
     #[prost(message, optional, tag = "4")]
     pub tip: ::core::option::Option<Tip>,

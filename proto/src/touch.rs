@@ -42,11 +42,16 @@ pub fn device(device: &Device) -> pb::Device {
 }
 
 /// Returns the tip in a message; the default tip if it is absent, with the default friction if that is absent.
-/// Couples it by a spring if the message has one, otherwise by a constraint. An unknown shape is a disc. Does not check
-/// the values.
-pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
-    tip.map_or_else(Tip::default, |tip| Tip {
-        shape: match tip.shape() {
+/// Couples it by a spring if the message has one, otherwise by a constraint. Does not check other values than the shape.
+///
+/// # Errors
+/// Refuses a shape that this program does not know (`{field}.shape`).
+pub fn from_tip(field: &str, tip: Option<&pb::Tip>) -> Result<Tip> {
+    let Some(tip) = tip else { return Ok(Tip::default()) };
+    let unknown =
+        |_| Refusal::new(Reason::OutOfRange, format!("{field}.shape"), "is a shape that this program does not know");
+    Ok(Tip {
+        shape: match pb::TipShape::try_from(tip.shape).map_err(unknown)? {
             pb::TipShape::Unspecified | pb::TipShape::Disc => TipShape::Disc,
             pb::TipShape::RigidDisc => TipShape::RigidDisc,
             pb::TipShape::Sphere => TipShape::Sphere,

@@ -31,7 +31,7 @@ pub enum TipShape {
 }
 
 impl TipShape {
-    /// All shapes, in the order of their numbers in snapshots.
+    /// All shapes, in the order of their numbers in journals.
     pub const ALL: [Self; 3] = [TipShape::Disc, TipShape::RigidDisc, TipShape::Sphere];
 
     /// Returns the name in scripts.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::rules::LedTip;
 use crate::budget::{Account, Taken};
 use palpate_refusal::{Reason, Refusal, Result, label, number};
 use palpate_tissue::limits::Limits;
@@ -18,8 +19,8 @@ pub(super) struct LeasedTool {
     duration_ns: u64,
     expires_ns: u64,
     pub(super) last_sequence: Option<u64>,
-    /// Radius of the tip that the newest command gives the tool, m.
-    pub(super) tip_radius_m: Option<f64>,
+    /// The tip that the newest command gives the tool.
+    pub(super) led_tip: Option<LedTip>,
     /// Key of the tool's newest command in the queue.
     pub(super) last_key: Option<QueueKey>,
     /// Set while a batch of commands is put in the queue: the tool's commands from this arrival on wait for the
@@ -96,7 +97,7 @@ impl Leases {
                 duration_ns,
                 expires_ns: now_ns.saturating_add(duration_ns),
                 last_sequence: None,
-                tip_radius_m: None,
+                led_tip: None,
                 last_key: None,
                 batch_since: None,
                 charge: None,
@@ -106,9 +107,9 @@ impl Leases {
         Ok(())
     }
 
-    /// Returns the tools with the radii of the tips that their newest commands give them, m.
-    pub(super) fn tips_m(&self) -> impl Iterator<Item = (u32, Option<f64>)> + '_ {
-        self.held.iter().map(|(tool, lease)| (*tool, lease.tip_radius_m))
+    /// Returns the tools with the tips that their newest commands give them.
+    pub(super) fn led_tips(&self) -> impl Iterator<Item = (u32, Option<LedTip>)> + '_ {
+        self.held.iter().map(|(tool, lease)| (*tool, lease.led_tip))
     }
 
     /// Extends a lease by its duration from `now_ns`.
@@ -210,7 +211,7 @@ impl Leases {
             duration_ns,
             expires_ns: now_ns.saturating_add(duration_ns),
             last_sequence: None,
-            tip_radius_m: None,
+            led_tip: None,
             last_key: None,
             batch_since: None,
             charge: None,

@@ -524,7 +524,8 @@ impl Session {
                     let path = if tip.grasps {
                         Path::of_grasp()
                     } else {
-                        let begins_m = self.model().shape().approach_m(place_m, tip.radius_m);
+                        let height_m = tip.shape.height_m(tip.radius_m);
+                        let begins_m = self.model().shape().approach_m(place_m, tip.radius_m, height_m);
                         begins_m.map_or_else(Path::default, Path::beginning_at)
                     };
                     self.tool(index).posed = Some(Posed { tip, path, client_time_s });

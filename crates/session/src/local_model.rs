@@ -7,7 +7,7 @@ use palpate_haptics::force_law::{Law, Row};
 use palpate_haptics::local_model::{self, ContactState, LocalModel};
 
 use palpate_tissue::response::tangent::Tangent;
-use palpate_tissue::{TangentInput, ToolContact};
+use palpate_tissue::{RestSurface, TangentInput, ToolContact};
 
 /// Forces below this do not limit the distance in which a model is valid, N.
 const MIN_N: f64 = 0.05;
@@ -104,7 +104,9 @@ impl Modeller {
         self.bounced = if below && feel.contact_state == ContactState::Free { self.bounced + 1 } else { 0 };
         if touches {
             // A dent tilts the surface under a tool; the law refers to the surface at rest.
-            self.surface = feel.rest.map(|rest| (rest.place_m, rest.normal)).or(self.surface);
+            let height_m = (feel.touching_m - feel.surface_m).dot(feel.normal);
+            let above = |rest: RestSurface| (rest.place_m + height_m * rest.normal, rest.normal);
+            self.surface = feel.rest.map(above).or(self.surface);
         } else if !(1..=BOUNCE_SAMPLES).contains(&self.bounced) {
             self.surface = Some((feel.touching_m, feel.normal));
         }

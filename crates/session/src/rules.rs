@@ -3,6 +3,7 @@
 use smallvec::SmallVec;
 
 use super::command::Command;
+use palpate_haptics::{Tip, TipShape};
 use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
@@ -108,17 +109,16 @@ fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
     shape.disc_work(radius_m).saturating_mul(2 * u64::from(substeps))
 }
 
-/// Refuses a tip of radius `now_m` that would make a step too long for the other sessions of its thread. `tips_m`
-/// are the radii of the session's other tips, m.
+/// Refuses a tip that would make a step too long for the other sessions of its thread. `tips` are the session's other tips.
 pub(super) fn check_contact_work(
     rules: &Rules,
     substeps: u32,
-    now_m: f64,
-    tips_m: impl Iterator<Item = f64>,
+    LedTip { radius_m: now_m, .. }: LedTip,
+    tips: impl Iterator<Item = LedTip>,
 ) -> Result<()> {
     let shape = rules.scene.shape();
     let most = rules.limits.contact_work;
-    let others = tips_m.fold(0_u64, |sum, radius_m| sum.saturating_add(contact_work(shape, radius_m, substeps)));
+    let others = tips.fold(0_u64, |sum, tip| sum.saturating_add(contact_work(shape, tip.radius_m, substeps)));
     let all = others.saturating_add(contact_work(shape, now_m, substeps));
     if all <= most {
         return Ok(());
@@ -137,17 +137,35 @@ pub(super) fn check_contact_work(
     Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
 }
 
-/// Returns the radius of the tip that a command gives its tool, m; `None` if it gives none.
-pub(super) fn tip_radius_m(command: &Command) -> Option<f64> {
-    if let Action::Pose { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
+/// What of a tip stays while a tool is led.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LedTip {
+    shape: TipShape,
+    radius_m: f64,
+}
+
+impl From<Tip> for LedTip {
+    fn from(Tip { shape, radius_m, .. }: Tip) -> Self {
+        LedTip { shape, radius_m }
+    }
+}
+
+/// Returns the tip that a command gives its tool; `None` if it gives none.
+pub(super) fn led_tip(command: &Command) -> Option<LedTip> {
+    if let Action::Pose { tip, .. } = &command.action { Some((*tip).into()) } else { None }
 }
 
 /// Refuses a change of the tip while it is in the tissue: the surface under a larger tip lies elsewhere, and
 /// meeting it at once would be a blow that no instrument gives.
-pub(super) fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
-    match (before_m, now_m) {
-        (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {
-            let [before_m, now_m] = [before_m, now_m].map(legible);
+pub(super) fn check_tip(before: Option<LedTip>, now: Option<LedTip>) -> Result<()> {
+    match (before, now) {
+        (Some(before), Some(now)) if before.shape != now.shape => {
+            let [before, now] = [before, now].map(|tip| tip.shape.name());
+            let message = format!("is {now}, but the tool is led with a tip that is {before}: release it first");
+            Err(Refusal::new(Reason::OutOfTurn, "pose.tip.shape", message))
+        }
+        (Some(before), Some(now)) if before.radius_m.to_bits() != now.radius_m.to_bits() => {
+            let [before_m, now_m] = [before, now].map(|tip| legible(tip.radius_m));
             let message = format!("is {now_m} m, but the tool is led with a tip of {before_m} m: release it first");
             Err(Refusal::new(Reason::OutOfTurn, "pose.tip.radius_m", message))
         }

@@ -5,7 +5,7 @@ use std::fmt;
 use std::sync::atomic::AtomicBool;
 
 use glam::DVec3;
-use palpate_haptics::{Coupling, Law, Tip};
+use palpate_haptics::{Coupling, Law, Tip, TipShape};
 
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
@@ -274,13 +274,17 @@ fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut 
         return Meeting::Held { moved_m };
     }
     let Some(Deepest { depth_m, rest_m }) = shape.deepest(&way, tip.radius_m) else { return Meeting::Beside };
+    let depth_m = depth_m + tip.shape.height_m(tip.radius_m);
     let disc = Disc::in_middle(laws.model, tip.radius_m).follow(laws.model, rest_m);
     if depth_m <= 0.0 {
         return Meeting::Above { gap_m: -depth_m };
     }
     let by_law_n = laws.under(disc).map(|law| law.at_depth(depth_m).force_n);
     match tip.coupling {
-        Coupling::Constraint => Meeting::Pressed { depth_m, force_n: by_law_n, is_bound: false },
+        // A sphere meets the tissue with a part of the disc.
+        Coupling::Constraint => {
+            Meeting::Pressed { depth_m, force_n: by_law_n, is_bound: tip.shape == TipShape::Sphere }
+        }
         Coupling::Spring { stiffness_n_per_m, .. } => {
             let force_n = by_law_n.map(|force_n| force_n.min(stiffness_n_per_m * depth_m));
             Meeting::Pressed { depth_m, force_n, is_bound: true }

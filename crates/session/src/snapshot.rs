@@ -44,7 +44,7 @@ pub const MAGIC: [u8; 8] = *b"PALPSNAP";
 
 /// Version of the format and of the arithmetic. A program that reads another version would continue with other
 /// bits, so it is refused.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 2;
 
 /// Memory for the parts per byte: the smallest entry of a list is three bytes, which take 24 in a vector that may
 /// have room for twice as many.

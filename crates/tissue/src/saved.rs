@@ -258,14 +258,22 @@ pub(crate) struct SavedContact {
     /// 0 free, 1 sticking, 2 sliding, 3 holding.
     pub(crate) contact_state: u8,
     pub(crate) normal: Vector,
-    pub(crate) side: Option<f64>,
+    pub(crate) side: SavedSide,
     pub(crate) offset_m: Vector,
     pub(crate) gap_m: Vector,
     pub(crate) is_new: bool,
     pub(crate) force_n: Vector,
     pub(crate) steady_n: Vector,
     pub(crate) velocity_m_per_s: Vector,
-    pub(crate) pressing: Option<SavedPressing>,
+}
+
+/// The side of the surface on which a tool is, 1 or -1, and how a rigid tip presses there. The first two have the bytes that an
+/// `Option` has: snapshots without rigid tips stay as they were before these.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum SavedSide {
+    Beside,
+    On(f64),
+    Pressed(f64, Box<SavedPressing>),
 }
 
 /// How a rigid tip presses: the place around which its samples were taken, the axis of the tip, by how much it is still drawn
@@ -349,11 +357,10 @@ pub(crate) enum SavedGrasp {
 /// A [`Tip`] as plain data, in a snapshot. Nothing of it is checked before [`SavedTip::restored`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SavedTip {
-    /// The number of the shape in [`TipShape::ALL`].
-    shape: u8,
     radius_m: f64,
     friction: f64,
-    grasps: bool,
+    /// 0 a disc that touches, 1 one that grasps, 2 a rigid disc, 3 a sphere.
+    kind: u8,
     /// Stiffness, N/m, and damping, N·s/m, of a spring coupling; `None` for a constraint.
     spring: Option<(f64, f64)>,
 }
@@ -598,15 +605,21 @@ pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Resu
     })
 }
 
+/// The shapes of tips and whether they grasp, in the order of [`SavedTip::kind`].
+const TIP_KINDS: [(TipShape, bool); 4] =
+    [(TipShape::Disc, false), (TipShape::Disc, true), (TipShape::RigidDisc, false), (TipShape::Sphere, false)];
+
 impl SavedTip {
     /// Converts a tip to plain data, without rounding.
+    #[allow(clippy::cast_possible_truncation)]
     pub fn of(tip: &Tip) -> Self {
         let Tip { shape, radius_m, friction, grasps, coupling } = *tip;
         let spring = match coupling {
             Coupling::Constraint => None,
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Some((stiffness_n_per_m, damping_n_s_per_m)),
         };
-        SavedTip { shape: shape as u8, radius_m, friction, grasps, spring }
+        let kind = TIP_KINDS.iter().position(|kind| *kind == (shape, grasps)).unwrap_or(0) as u8;
+        SavedTip { radius_m, friction, kind, spring }
     }
 
     /// Checks a saved tip against a tissue and returns it.
@@ -615,9 +628,9 @@ impl SavedTip {
     /// Refuses a tip that a command may not have either ([`check_tip`]): a radius that is not above 0 or too large for
     /// the tissue, a friction outside 0 to 10, or a coupling out of range. The field is that of `snapshot.tip`.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
-        let SavedTip { shape, radius_m, friction, grasps, spring } = *self;
-        let shape =
-            TipShape::ALL.get(usize::from(shape)).copied().ok_or_else(|| unsound("an unknown shape of a tip"))?;
+        let SavedTip { radius_m, friction, kind, spring } = *self;
+        let (shape, grasps) =
+            TIP_KINDS.get(usize::from(kind)).copied().ok_or_else(|| unsound("an unknown kind of tip"))?;
         let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {
             stiffness_n_per_m,
             damping_n_s_per_m,

@@ -250,10 +250,10 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     }
 
     /// Returns the place, m, where a newly placed tool with a tip of `radius_m` begins on its way to `place_m`:
-    /// on the side of `place_m`, and at least 2 mm off the surface at rest, so that it meets the surface as a
-    /// hand does. A place at most `radius_m` inside a closed mesh counts as outside. `None` on a sheet, where a
+    /// on the side of `place_m`, and at least 2 mm farther off the surface at rest than `height_m`, where it would touch, so
+    /// that it meets the surface as a hand does. A place at most `radius_m` inside a closed mesh counts as outside. `None` on a sheet, where a
     /// tool begins straight above `place_m`.
-    fn approach_m(&self, _place_m: DVec3, _radius_m: f64) -> Option<DVec3> {
+    fn approach_m(&self, _place_m: DVec3, _radius_m: f64, _height_m: f64) -> Option<DVec3> {
         None
     }
 

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
 
+use palpate_haptics::TipShape;
 use palpate_refusal::printable::{printable, printable_json};
 use palpate_session::journal::replay::{JournalItem, items};
 use palpate_session::journal::{JournalReader, pb};
@@ -172,7 +173,7 @@ fn in_json(input: &pb::Input) -> Value {
             }
             Some(Action::Pose(pose)) => {
                 line["pose"] = json!({ "place_m": vector(pose.place_m), "velocity_m_per_s": vector(pose.velocity_m_per_s),
-                    "radius_m": pose.tip.map(|tip| tip.radius_m), "grasps": pose.tip.map(|tip| tip.grasps) });
+                    "shape": pose.tip.and_then(|tip| TipShape::ALL.get(tip.shape as usize)).map(|shape| shape.name()), "radius_m": pose.tip.map(|tip| tip.radius_m), "grasps": pose.tip.map(|tip| tip.grasps) });
             }
             Some(Action::Release(_)) | None => {}
         }

@@ -107,7 +107,7 @@ impl KeepaliveTimer {
 async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
     let handle = services.session(&open.session_id).await?;
     let device = open.device.as_ref().map(touch::from_device).transpose()?;
-    let tip = touch::from_tip(open.tip.as_ref());
+    let tip = touch::from_tip("tip", open.tip.as_ref())?;
     // A stream that neither renders nor declares a tip may push with forces on any tissue.
     if device.is_some() || open.tip.is_some() {
         check_tip("tip", handle.model.shape(), &tip)?;

@@ -54,7 +54,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
         Message::Pose(pose) => Action::Pose {
             place_m: from_pose(pose)?,
             velocity_m_per_s: pose.velocity_m_per_s.as_ref().map(|velocity| from_vector(Some(velocity))),
-            tip: from_tip(pose.tip.as_ref()),
+            tip: from_tip("pose.tip", pose.tip.as_ref())?,
         },
         Message::Release(_) => Action::Release,
     };

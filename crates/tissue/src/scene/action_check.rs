@@ -76,13 +76,17 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
     Ok(())
 }
 
+/// Least radius of a rigid tip, in edges of a cell.
+const LEAST_RIGID: f64 = 0.25;
+
 /// Checks that a tip suits the tissue: radius, friction and coupling.
 ///
 /// # Errors
 /// Refuses a value that is not finite or out of range: a radius must be above 0 and at most the tissue's
 /// longest side, and on a mesh at most 32 mean edge lengths; friction is from 0 to 10; a coupling spring has a
 /// stiffness from 1e-12 to 1e12 N/m and a damping from 0 to 1e12 N·s/m. `field` is the tip's key: the refusal
-/// gives `{field}.radius_m` and the like. A rigid shape is for solids, without a grasp and without a spring.
+/// gives `{field}.radius_m` and the like. A rigid shape is for solids, from a quarter of
+/// a cell on, without a grasp and without a spring.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let (most_m, what) = shape.most_tip_radius_m();
     let range = format!("above 0 and at most {}, {what}", legible(most_m));
@@ -94,6 +98,9 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         if !shape.takes_rigid_tips() {
             return refuse("a rigid tip needs a solid: this tissue is touched by a \"disc\"");
         }
+        let least_m = LEAST_RIGID * shape.edge_m();
+        let range = format!("at least {}, a quarter of a cell, for a rigid tip", legible(least_m));
+        number(&format!("{field}.radius_m"), tip.radius_m, &range, |radius_m| radius_m >= least_m)?;
         if tip.grasps {
             return refuse("a tip that grasps is a \"disc\"");
         }

@@ -945,14 +945,15 @@ impl RestShape for MeshShape {
         self.surface();
     }
 
-    fn approach_m(&self, place_m: DVec3, radius_m: f64) -> Option<DVec3> {
+    fn approach_m(&self, place_m: DVec3, radius_m: f64, height_m: f64) -> Option<DVec3> {
         let surface = self.surface();
         let nearest = surface.nearest(place_m)?;
         let (at_m, outward) = (surface.at_m(&nearest), nearest.frame[0].cross(nearest.frame[1]));
         let side = surface.side((place_m - at_m).dot(outward), radius_m);
         // A tool beside a rim, or far enough off the surface, begins where it is.
-        let is_off = (place_m - at_m).dot(side * outward) >= APPROACH_M;
-        Some(if is_off { place_m } else { at_m + APPROACH_M * side * outward })
+        let begins_m = height_m + APPROACH_M;
+        let is_off = (place_m - at_m).dot(side * outward) >= begins_m;
+        Some(if is_off { place_m } else { at_m + begins_m * side * outward })
     }
 
     fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {

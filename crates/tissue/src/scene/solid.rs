@@ -129,11 +129,11 @@ impl Solid {
         Ok(Solid::new(Arc::new(shape.map_err(named)?), material))
     }
 
-    /// Returns Young's modulus of the cube around a place, Pa.
-    pub(crate) fn modulus_pa(&self, place: &CellPlace) -> f64 {
+    /// Returns the factor of E of the cube around a place.
+    pub(crate) fn factor(&self, place: &CellPlace) -> f64 {
         let shape = &self.shape;
         let cell = shape.lattice().index(shape.corner_at(shape.corner_of(PointId::new(place.points[0] as usize))));
-        self.material.youngs_modulus_pa * self.weights[cell] / shape.counted_part(cell).max(f64::MIN_POSITIVE)
+        self.weights[cell] / shape.counted_part(cell).max(f64::MIN_POSITIVE)
     }
 
     /// Creates a solid of a material without inclusions.

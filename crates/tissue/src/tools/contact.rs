@@ -57,7 +57,7 @@ use crate::body::window::Window;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
 use crate::response::tangent::{LinearPatch, Tangent};
-use crate::saved::{Checks, SavedContact, SavedTip, ensure};
+use crate::saved::{Checks, SavedContact, SavedSide, SavedTip, ensure};
 use crate::tools::rigid_tip::RigidTip;
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_refusal::Result;
@@ -300,14 +300,17 @@ impl Tool {
             to_m: self.to_m.into(),
             contact_state: CONTACT_STATES.iter().position(|state| *state == self.contact_state).unwrap_or(0) as u8,
             normal: self.normal.into(),
-            side: self.side,
+            side: match (self.side, self.rigid.as_ref().and_then(RigidTip::saved)) {
+                (None, _) => SavedSide::Beside,
+                (Some(side), None) => SavedSide::On(side),
+                (Some(side), Some(pressing)) => SavedSide::Pressed(side, Box::new(pressing)),
+            },
             offset_m: self.offset_m.into(),
             gap_m: self.gap_m.into(),
             is_new: self.is_new,
             force_n: self.force_n.into(),
             steady_n: self.steady_n.into(),
             velocity_m_per_s: self.velocity_m_per_s.into(),
-            pressing: self.rigid.as_ref().and_then(RigidTip::saved),
         }
     }
 
@@ -315,10 +318,15 @@ impl Tool {
         let tip = saved.tip.restored(checks)?;
         let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
         ensure(contact_state.is_some(), "an unknown state of contact")?;
-        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "an unknown side of the tissue")?;
+        let (side, pressing) = match &saved.side {
+            SavedSide::Beside => (None, None),
+            SavedSide::On(side) => (Some(*side), None),
+            SavedSide::Pressed(side, pressing) => (Some(*side), Some(&**pressing)),
+        };
+        ensure(side.is_none_or(|side| side.abs() == 1.0), "an unknown side of the tissue")?;
         let footprint = Footprint::restored(model, tip.radius_m, &saved.place)?;
         let rigid = match tip.shape.is_rigid() {
-            true => Some(RigidTip::restored(saved.pressing.as_ref(), tip, &footprint, model, checks)?),
+            true => Some(RigidTip::restored(pressing, tip, &footprint, model, checks)?),
             false => None,
         };
         Ok(Tool {
@@ -329,7 +337,7 @@ impl Tool {
             to_m: checks.vector(saved.to_m)?,
             contact_state: contact_state.unwrap_or(ContactState::Free),
             normal: checks.vector(saved.normal)?,
-            side: saved.side,
+            side,
             offset_m: checks.vector(saved.offset_m)?,
             gap_m: checks.vector(saved.gap_m)?,
             is_new: saved.is_new,

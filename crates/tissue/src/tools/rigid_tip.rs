@@ -30,6 +30,7 @@
 //! A tool that is placed within the tissue, or that jumps into it, comes in along its axis at a bounded speed
 //! ([`MAX_DEEPENING`]). The work of a tool is F·ẋ with x the place that it has then.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -72,6 +73,9 @@ const MAX_DEEPENING: f64 = 0.05;
 /// The cosine between the outward normal of a sample and the direction from which a tip may press it.
 const FACING: f64 = 0.1;
 
+/// Bound of a length, m, and of an energy, J, in a snapshot.
+const LARGEST: f64 = 1e30;
+
 /// A sample whose points can move less than this part of what one free point with all of its weight would is as good as fixed,
 /// and the tip does not feel it.
 const FIXED_PART: f64 = 1e-3;
@@ -81,10 +85,10 @@ const FIXED_PART: f64 = 1e-3;
 struct Sample {
     rest_m: DVec3,
     outward: DVec3,
-    /// s·A of the whole sample, N/m.
-    stiffness_n_per_m: f64,
+    /// s·A of the whole sample divided by the modulus of the tissue, m.
+    relative_stiffness_m: f64,
     /// Its points in [`RigidTip::nodes`], with their weights.
-    nodes: [u16; 8],
+    nodes: [u32; 8],
     weights: [f64; 8],
     /// Σ w²/mass over its movable points.
     relative_inverse_mass: f64,
@@ -113,6 +117,14 @@ struct Touched {
     stiffness_n_per_m: f64,
 }
 
+/// Where samples were taken: the place, its rest position, m, and the unit normal out of the tissue there.
+#[derive(Debug, Clone, Copy)]
+struct SamplesPlace {
+    saved: SavedPlace,
+    rest_m: DVec3,
+    outward: DVec3,
+}
+
 /// What a tip did in a substep.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct TipPress {
@@ -129,11 +141,11 @@ pub(crate) struct RigidTip {
     tip: Tip,
     samples: Arc<[Sample]>,
     nodes: Arc<[TouchedPoint]>,
-    /// Where the samples were taken: the place, and its rest position, m.
-    around: Option<(SavedPlace, DVec3)>,
-    /// s·A of each sample where the tip is, N/m, and the rest position of that place, m; `None` after samples were taken.
+    around: Option<SamplesPlace>,
+    /// s·A of each sample where the tip is, N/m, and the rest position of that place, m, with the modulus of the tissue, Pa;
+    /// `None` after samples were taken.
     stiffness_n_per_m: Vec<f64>,
-    covered_m: Option<DVec3>,
+    covers: Option<(DVec3, f64)>,
     /// Unit vector along which the tool met the tissue, out of the tissue.
     axis: DVec3,
     /// By how much the tip is behind the tool along the axis, m.
@@ -159,7 +171,7 @@ impl RigidTip {
             nodes: Arc::default(),
             around: None,
             stiffness_n_per_m: Vec::new(),
-            covered_m: None,
+            covers: None,
             axis: DVec3::Z,
             drawn_back_m: 0.0,
             forces_n: Vec::new(),
@@ -172,7 +184,7 @@ impl RigidTip {
     }
 
     pub(crate) fn saved(&self) -> Option<SavedPressing> {
-        let (around, _) = self.around?;
+        let around = self.around?.saved;
         let numbered = self.forces_n.iter().zip(0..).filter(|(force_n, _)| **force_n != DVec3::ZERO);
         Some(SavedPressing {
             around,
@@ -196,8 +208,8 @@ impl RigidTip {
         restored.take_samples(model, &Footprint::restored(model, tip.radius_m, &saved.around)?);
         restored.axis = checks.vector(saved.axis)?;
         ensure((restored.axis.length() - 1.0).abs() < 1e-6, "a tool whose axis has no direction")?;
-        let is_length = |length: f64| (0.0..1e3).contains(&length);
-        ensure(is_length(saved.drawn_back_m) && is_length(saved.stored_j), "a tool that is drawn back by no length")?;
+        let is_sound = |number: f64| (0.0..LARGEST).contains(&number);
+        ensure(is_sound(saved.drawn_back_m) && is_sound(saved.stored_j), "a tool that is drawn back by no length")?;
         (restored.drawn_back_m, restored.stored_j) = (saved.drawn_back_m, saved.stored_j);
         for (number, force_n) in &saved.forces_n {
             let force_n = checks.vector(*force_n)?;
@@ -271,7 +283,11 @@ impl RigidTip {
     fn take_samples_near(&mut self, model: &Model, footprint: &Footprint) {
         let far_m = TAKEN_ANEW * self.tip.radius_m;
         let anchor_m = footprint.anchor_m();
-        if self.around.is_none_or(|(_, around_m)| around_m.distance(anchor_m) > far_m) {
+        // On a thin part of the tissue, the other side is near.
+        let is_other = |around: &SamplesPlace| {
+            around.rest_m.distance(anchor_m) > far_m || around.outward.dot(footprint.at_rest().1) < 0.5
+        };
+        if self.around.as_ref().is_none_or(is_other) {
             self.take_samples(model, footprint);
         }
     }
@@ -284,7 +300,6 @@ impl RigidTip {
         let mut places: Vec<usize> = taken.iter().flat_map(|sample| sample.cell.points.iter().map(place_of)).collect();
         places.sort_unstable();
         places.dedup();
-        places.truncate(usize::from(u16::MAX));
         let node = |place: usize| {
             let is_fixed = model.fixed.binary_search(&place).is_ok();
             let inverse_mass = if is_fixed { 0.0 } else { model.relative_mass_at(place).recip() };
@@ -296,16 +311,14 @@ impl RigidTip {
             if numbers.iter().any(Option::is_none) {
                 return None;
             }
-            let numbers = numbers.map(|number| number.unwrap_or(0) as u16);
+            let numbers = numbers.map(|number| number.unwrap_or(0) as u32);
             let weights = sample.cell.weights;
-            let parts = numbers
-                .iter()
-                .zip(&weights)
-                .map(|(node, weight)| weight * weight * nodes[usize::from(*node)].inverse_mass);
+            let parts =
+                numbers.iter().zip(&weights).map(|(node, weight)| weight * weight * nodes[*node as usize].inverse_mass);
             Some(Sample {
                 rest_m: sample.rest_m,
                 outward: sample.outward,
-                stiffness_n_per_m: contact_n_per_m3(model, &sample.cell) * sample.area_m2,
+                relative_stiffness_m: relative_contact_per_m(model, &sample.cell) * sample.area_m2,
                 nodes: numbers,
                 weights,
                 relative_inverse_mass: parts.sum(),
@@ -315,16 +328,22 @@ impl RigidTip {
         // Forces stay with the parts of the surface that they act on.
         let mut forces_n = vec![DVec3::ZERO; samples.len()];
         let mut stiffness_n_per_m = vec![0.0; samples.len()];
+        let key =
+            |sample: &Sample| (sample.rest_m.to_array().map(f64::to_bits), sample.outward.to_array().map(f64::to_bits));
+        let numbers: BTreeMap<_, _> = samples.iter().zip(0..).map(|(sample, number)| (key(sample), number)).collect();
         let before = self.forces_n.iter().enumerate().filter(|(_, force_n)| **force_n != DVec3::ZERO);
         for (old, force_n) in before {
-            let Sample { rest_m, outward, .. } = self.samples[old];
-            let same = samples.iter().position(|sample| sample.rest_m == rest_m && sample.outward == outward);
-            if let Some(number) = same {
+            if let Some(number) = numbers.get(&key(&self.samples[old])).copied() {
+                let number: usize = number;
                 (forces_n[number], stiffness_n_per_m[number]) = (*force_n, self.stiffness_n_per_m[old]);
             }
         }
-        self.around = Some((footprint.saved(), footprint.anchor_m()));
-        self.covered_m = None;
+        self.around = Some(SamplesPlace {
+            saved: footprint.saved(),
+            rest_m: footprint.anchor_m(),
+            outward: footprint.at_rest().1,
+        });
+        self.covers = None;
         (self.samples, self.nodes, self.forces_n, self.stiffness_n_per_m) =
             (samples, nodes, forces_n, stiffness_n_per_m);
         self.spread();
@@ -337,7 +356,7 @@ impl RigidTip {
         for (sample, force_n) in self.samples.iter().zip(&self.forces_n).filter(|(_, force_n)| **force_n != DVec3::ZERO)
         {
             for (node, weight) in sample.nodes.iter().zip(sample.weights) {
-                self.steady_n[usize::from(*node)] += weight * *force_n;
+                self.steady_n[*node as usize] += weight * *force_n;
             }
         }
     }
@@ -354,16 +373,22 @@ impl RigidTip {
 
     /// Lets the tip cover what is under a disc. Returns the energy that the contact takes, J.
     fn cover(&mut self, model: &Model, footprint: &Footprint) -> f64 {
-        if self.covered_m == Some(footprint.anchor_m()) {
+        let covers = Some((footprint.anchor_m(), modulus_pa(model)));
+        if self.covers == covers {
             return 0.0;
         }
-        self.covered_m = Some(footprint.anchor_m());
+        // A tissue that has changed is no work of the tool.
+        let is_same = self.covers.is_none_or(|(_, before_pa)| before_pa == modulus_pa(model));
+        self.covers = covers;
         let mut gained_j = 0.0;
         let (anchor_m, rest_outward) = (footprint.anchor_m(), footprint.at_rest().1);
+        let modulus_pa = modulus_pa(model);
         for (number, sample) in self.samples.iter().enumerate() {
-            let now = sample.stiffness_n_per_m * self.part_under(sample, anchor_m, rest_outward, model.unit_m);
+            let now = modulus_pa
+                * sample.relative_stiffness_m
+                * self.part_under(sample, anchor_m, rest_outward, model.unit_m);
             let before = std::mem::replace(&mut self.stiffness_n_per_m[number], now);
-            if before > 0.0 {
+            if before > 0.0 && is_same {
                 gained_j += 0.5 * (now - before) * (self.forces_n[number].length() / before).powi(2);
             }
         }
@@ -464,7 +489,7 @@ impl RigidTip {
         self.touched.clear();
         for (number, sample) in samples.iter().enumerate() {
             let force_n = self.forces_n[number];
-            let parts = || sample.nodes.iter().map(|node| usize::from(*node)).zip(sample.weights);
+            let parts = || sample.nodes.iter().map(|node| *node as usize).zip(sample.weights);
             let moved_m = parts().fold(DVec3::ZERO, |sum, (node, weight)| sum + weight * self.displacements_m[node]);
             let from_m = sample.rest_m + moved_m - place_m;
             let (way, deep_m) = match shape {
@@ -511,7 +536,7 @@ impl RigidTip {
             (held_n, sliding_n) = (0.0, 0.0);
             for at in touched.iter() {
                 let sample = &samples[at.sample];
-                let parts = || sample.nodes.iter().map(|node| usize::from(*node)).zip(sample.weights);
+                let parts = || sample.nodes.iter().map(|node| *node as usize).zip(sample.weights);
                 let moved_n: DVec3 = parts().map(|(node, weight)| weight * change_n[node]).sum();
                 let now_n = forces_n[at.sample];
                 let (pressed_n, stiffness) = (now_n.dot(at.way), at.stiffness_n_per_m);
@@ -545,11 +570,16 @@ impl RigidTip {
     }
 }
 
-/// Returns s of the cell around a sample, N/m³.
-fn contact_n_per_m3(model: &Model, cell: &CellPlace) -> f64 {
+/// Returns s of the cell around a sample divided by the modulus of the tissue, 1/m.
+fn relative_contact_per_m(model: &Model, cell: &CellPlace) -> f64 {
     let Body::Solid(solid) = &model.scene.body else { return 0.0 };
     let nu = solid.material.poissons_ratio;
-    CONTACT_STIFFNESS * solid.modulus_pa(cell) / ((1.0 - nu * nu) * model.unit_m)
+    CONTACT_STIFFNESS * solid.factor(cell) / ((1.0 - nu * nu) * model.unit_m)
+}
+
+/// Returns Young's modulus of the tissue without inclusions, Pa: that of the scene, or another one since.
+fn modulus_pa(model: &Model) -> f64 {
+    model.scene.springs.stiffness_n_per_m / model.unit_m
 }
 
 /// Returns the distance b from the surface of a tip to its core, m; a disc has none.

@@ -582,8 +582,8 @@ impl RestShape for SolidShape {
         self.surface.top_m()
     }
 
-    fn approach_m(&self, place_m: DVec3, radius_m: f64) -> Option<DVec3> {
-        self.surface.approach_m(place_m, radius_m)
+    fn approach_m(&self, place_m: DVec3, radius_m: f64, height_m: f64) -> Option<DVec3> {
+        self.surface.approach_m(place_m, radius_m, height_m)
     }
 
     fn prepare_contact(&self) {
