@@ -77,7 +77,7 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
 }
 
 /// Least radius of a rigid tip, in edges of a cell.
-const LEAST_RIGID: f64 = 0.25;
+const MIN_RIGID_RADIUS: f64 = 0.25;
 
 /// Checks that a tip suits the tissue: radius, friction and coupling.
 ///
@@ -98,7 +98,7 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         if !shape.takes_rigid_tips() {
             return refuse("a rigid tip needs a solid: this tissue is touched by a \"disc\"");
         }
-        let least_m = LEAST_RIGID * shape.edge_m();
+        let least_m = MIN_RIGID_RADIUS * shape.edge_m();
         let range = format!("at least {}, a quarter of a cell, for a rigid tip", legible(least_m));
         number(&format!("{field}.radius_m"), tip.radius_m, &range, |radius_m| radius_m >= least_m)?;
         if tip.grasps {
