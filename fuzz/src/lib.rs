@@ -299,7 +299,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             friction: Some(0.3),
             grasps: true,
             spring: Some(pb::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }),
-            shape: pb::TipShape::Sphere.into(),
+            shape: pb::TipShape::Disc.into(),
         }),
     });
     let actions = [force, position, pose, pb::command::Action::Release(pb::Release {})];
