@@ -6,7 +6,7 @@ use smallvec::SmallVec;
 use super::command::Command;
 use super::intake::Intake;
 use super::lease::LeaseId;
-use super::rules::{CheckedCommands, LedTip, check_contact_work, check_tip, led_tip};
+use super::rules::{CheckedCommands, LeasedTip, check_contact_work, check_tip, leased_tip};
 use palpate_refusal::{Reason, Refusal, Result};
 
 /// Largest number of commands that one call of [`Intake::go_on`] puts in the queue.
@@ -30,7 +30,7 @@ struct ToolCommands {
     /// Number of commands.
     count: usize,
     /// The tip after them.
-    led_tip: Option<LedTip>,
+    leased_tip: Option<LeasedTip>,
 }
 
 /// What a batch brings to each of its tools, by ascending tool. A batch for one tool takes no memory of its own.
@@ -95,17 +95,17 @@ impl Intake {
                 return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
             }
             command.sequence = Some(sequence);
-            let led_tip = led_tip(command);
-            let before_tip = coming.map_or(lease.led_tip, |coming| coming.led_tip);
-            check_tip(before_tip, led_tip)?;
-            if let (None, Some(now)) = (before_tip, led_tip) {
-                let of = |(tool, waiting)| last.of(tool).map_or(waiting, |coming| coming.led_tip);
-                let others = self.leases.led_tips().filter(|(tool, _)| *tool != command.tool).filter_map(of);
+            let leased_tip = leased_tip(command);
+            let before_tip = coming.map_or(lease.leased_tip, |coming| coming.leased_tip);
+            check_tip(before_tip, leased_tip)?;
+            if let (None, Some(now)) = (before_tip, leased_tip) {
+                let of = |(tool, waiting)| last.of(tool).map_or(waiting, |coming| coming.leased_tip);
+                let others = self.leases.leased_tips().filter(|(tool, _)| *tool != command.tool).filter_map(of);
                 check_contact_work(&self.rules, self.substeps(), now, others)?;
             }
             let newest = before.map_or(sequence, |before| before.max(sequence));
             let count = coming.map_or(0, |coming| coming.count) + 1;
-            last.set(ToolCommands { tool: command.tool, sequence: newest, count, led_tip });
+            last.set(ToolCommands { tool: command.tool, sequence: newest, count, leased_tip });
         }
         // A limit per tool, so that no holder fills the queue for the others.
         for ToolCommands { tool, count, .. } in &last.0 {

@@ -7,7 +7,7 @@ use super::Session;
 use super::command::{Command, Due};
 use super::lease::{LeaseId, Leases, QueueKey, not_held};
 use super::queue::{Discarded, Queue};
-use super::rules::{Commands, LedTip, Rules, led_tip};
+use super::rules::{Commands, LeasedTip, Rules, leased_tip};
 use super::schedule::Schedule;
 use crate::budget::{Account, Purpose, Resource, Taken};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -78,7 +78,7 @@ pub struct Intake {
     pub(super) arrivals: u64,
     pub(super) next_step: u64,
     /// The tips of tools that a continued session has in its tissue and that no client holds yet.
-    led_tips: BTreeMap<u32, LedTip>,
+    leased_tips: BTreeMap<u32, LeasedTip>,
     /// The schedule of a resting session, and the step up to which steps are skipped and not computed.
     resting: Option<(Schedule, u64)>,
     /// Substeps per step of the first tissue; 0 if the session shares its thread with no other, so that the cost of
@@ -108,7 +108,7 @@ impl Intake {
             changed_to: None,
             arrivals: 0,
             next_step: 0,
-            led_tips: BTreeMap::new(),
+            leased_tips: BTreeMap::new(),
             resting: None,
             substeps: 0,
             changed: false,
@@ -145,8 +145,8 @@ impl Intake {
     /// that it has.
     #[must_use]
     pub fn continued(self, session: &Session, changed_to: Option<Arc<Model>>) -> Self {
-        let led_tips = session.tips().map(|(tool, tip)| (tool, tip.into())).collect();
-        Intake { next_step: session.step_count(), changed_to, led_tips, ..self }
+        let leased_tips = session.tips().map(|(tool, tip)| (tool, tip.into())).collect();
+        Intake { next_step: session.step_count(), changed_to, leased_tips, ..self }
     }
 
     /// Takes the memory of `more` commands beside those that wait, or refuses.
@@ -188,9 +188,9 @@ impl Intake {
 
     /// Sets the tip of a tool that is acquired: the one that the tool has in the tissue of a continued session.
     pub(super) fn take_tip(&mut self, tool: u32) {
-        let led_tip = self.led_tips.remove(&tool);
+        let leased_tip = self.leased_tips.remove(&tool);
         if let Some(lease) = self.leases.get_mut(tool) {
-            lease.led_tip = led_tip;
+            lease.leased_tip = leased_tip;
         }
     }
 
@@ -269,7 +269,7 @@ impl Intake {
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(command.tool) {
             lease.last_sequence = lease.last_sequence.max(command.sequence);
-            lease.led_tip = led_tip(&command);
+            lease.leased_tip = leased_tip(&command);
             let last = lease.last_key.replace(key);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply
             // to poses that are played by client time (`palpate_haptics::pose_playback`), where each one counts.

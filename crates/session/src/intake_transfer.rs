@@ -5,7 +5,7 @@ use super::input::Input;
 use super::intake::Intake;
 use super::lease::HandedLease;
 use super::queue::Discarded;
-use super::rules::led_tip;
+use super::rules::leased_tip;
 use crate::budget::{Purpose, Resource};
 use palpate_refusal::Refusal;
 
@@ -82,7 +82,7 @@ impl Intake {
         if !due.ends_lease {
             self.counts.accepted += 1;
             if let Some(lease) = self.leases.get_mut(due.command.tool) {
-                lease.led_tip = led_tip(&due.command);
+                lease.leased_tip = leased_tip(&due.command);
                 lease.last_key = Some(key);
             }
         }

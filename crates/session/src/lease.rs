@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::rules::LedTip;
+use super::rules::LeasedTip;
 use crate::budget::{Account, Taken};
 use palpate_refusal::{Reason, Refusal, Result, label, number};
 use palpate_tissue::limits::Limits;
@@ -20,7 +20,7 @@ pub(super) struct LeasedTool {
     expires_ns: u64,
     pub(super) last_sequence: Option<u64>,
     /// The tip that the newest command gives the tool.
-    pub(super) led_tip: Option<LedTip>,
+    pub(super) leased_tip: Option<LeasedTip>,
     /// Key of the tool's newest command in the queue.
     pub(super) last_key: Option<QueueKey>,
     /// Set while a batch of commands is put in the queue: the tool's commands from this arrival on wait for the
@@ -97,7 +97,7 @@ impl Leases {
                 duration_ns,
                 expires_ns: now_ns.saturating_add(duration_ns),
                 last_sequence: None,
-                led_tip: None,
+                leased_tip: None,
                 last_key: None,
                 batch_since: None,
                 charge: None,
@@ -108,8 +108,8 @@ impl Leases {
     }
 
     /// Returns the tools with the tips that their newest commands give them.
-    pub(super) fn led_tips(&self) -> impl Iterator<Item = (u32, Option<LedTip>)> + '_ {
-        self.held.iter().map(|(tool, lease)| (*tool, lease.led_tip))
+    pub(super) fn leased_tips(&self) -> impl Iterator<Item = (u32, Option<LeasedTip>)> + '_ {
+        self.held.iter().map(|(tool, lease)| (*tool, lease.leased_tip))
     }
 
     /// Extends a lease by its duration from `now_ns`.
@@ -211,7 +211,7 @@ impl Leases {
             duration_ns,
             expires_ns: now_ns.saturating_add(duration_ns),
             last_sequence: None,
-            led_tip: None,
+            leased_tip: None,
             last_key: None,
             batch_since: None,
             charge: None,

@@ -113,8 +113,8 @@ fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
 pub(super) fn check_contact_work(
     rules: &Rules,
     substeps: u32,
-    LedTip { radius_m: now_m, .. }: LedTip,
-    tips: impl Iterator<Item = LedTip>,
+    LeasedTip { radius_m: now_m, .. }: LeasedTip,
+    tips: impl Iterator<Item = LeasedTip>,
 ) -> Result<()> {
     let shape = rules.scene.shape();
     let most = rules.limits.contact_work;
@@ -139,25 +139,25 @@ pub(super) fn check_contact_work(
 
 /// What of a tip stays while a tool is led.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct LedTip {
+pub(super) struct LeasedTip {
     shape: TipShape,
     radius_m: f64,
 }
 
-impl From<Tip> for LedTip {
+impl From<Tip> for LeasedTip {
     fn from(Tip { shape, radius_m, .. }: Tip) -> Self {
-        LedTip { shape, radius_m }
+        LeasedTip { shape, radius_m }
     }
 }
 
 /// Returns the tip that a command gives its tool; `None` if it gives none.
-pub(super) fn led_tip(command: &Command) -> Option<LedTip> {
+pub(super) fn leased_tip(command: &Command) -> Option<LeasedTip> {
     if let Action::Pose { tip, .. } = &command.action { Some((*tip).into()) } else { None }
 }
 
 /// Refuses a change of the tip while it is in the tissue: the surface under a larger tip lies elsewhere, and
 /// meeting it at once would be a blow that no instrument gives.
-pub(super) fn check_tip(before: Option<LedTip>, now: Option<LedTip>) -> Result<()> {
+pub(super) fn check_tip(before: Option<LeasedTip>, now: Option<LeasedTip>) -> Result<()> {
     match (before, now) {
         (Some(before), Some(now)) if before.shape != now.shape => {
             let [before, now] = [before, now].map(|tip| tip.shape.name());

@@ -75,6 +75,15 @@ impl<T: Real> State<T> {
         State { u: zero(), d: zero(), kept: vec![past; kept] }
     }
 
+    /// Adds a change to u and d of a point, with a factor for each.
+    pub(crate) fn add(&mut self, layout: &Layout, [i, j]: [usize; 2], change: [f64; 3], [of_u, of_d]: [f64; 2]) {
+        for (c, change) in change.into_iter().enumerate() {
+            let at = c * layout.plane + i * layout.stride + j;
+            self.u[at] += T::of(of_u * change);
+            self.d[at] += T::of(of_d * change);
+        }
+    }
+
     /// Creates a state of zeros with separate memory for each field. The system supplies zeroed pages at the
     /// first write.
     pub(crate) fn zero(layout: &Layout, kept: usize) -> Self {

@@ -253,8 +253,8 @@ impl Contacts {
     }
 }
 
-/// Adds to u and d of the disc's points the effect of `force_n` with the factors `[of_u, of_d]`
-/// (`Scheme::kick`, `Scheme::constant`).
+/// Adds to u and d of the disc's points the effect of `force_n` with the factors `of` for u and d (`Scheme::kick`,
+/// `Scheme::constant`).
 pub(crate) fn push<T: Real>(
     model: &Model,
     plan: &Plan,
@@ -262,18 +262,11 @@ pub(crate) fn push<T: Real>(
     state: &mut State<T>,
     footprint: &Footprint,
     force_n: DVec3,
-    [of_u, of_d]: [f64; 2],
+    of: [f64; 2],
 ) {
     let scale = plan.force_scale(&model.scene);
-    for WeightedNode { point: [i, j], mass, weight, .. } in
-        footprint.reached().iter().copied().filter(|point| point.free)
-    {
-        for c in 0..3 {
-            let at = c * layout.plane + i * layout.stride + j;
-            let change = scale * weight * force_n[c] / mass;
-            state.u[at] += T::of(of_u * change);
-            state.d[at] += T::of(of_d * change);
-        }
+    for WeightedNode { point, mass, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
+        state.add(layout, point, force_n.to_array().map(|force_n| scale * weight * force_n / mass), of);
     }
 }
 
@@ -325,10 +318,8 @@ impl Tool {
         };
         ensure(side.is_none_or(|side| side.abs() == 1.0), "an unknown side of the tissue")?;
         let footprint = Footprint::restored(model, tip.radius_m, &saved.place)?;
-        let rigid = match tip.shape.is_rigid() {
-            true => Some(RigidTip::restored(pressing, tip, &footprint, model, checks)?),
-            false => None,
-        };
+        let restored = || RigidTip::restored(pressing, tip, &footprint, model, checks);
+        let rigid = tip.shape.is_rigid().then(restored).transpose()?;
         Ok(Tool {
             number: checks.tool(saved.number)?,
             tip,

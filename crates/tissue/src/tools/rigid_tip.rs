@@ -40,7 +40,7 @@ use crate::body::footprint::Footprint;
 use crate::body::model::{Model, Plan, displacement_m};
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
-use crate::saved::{Checks, SavedPlace, SavedPressing, ensure};
+use crate::saved::{Checks, SavedPlace, SavedPressing, ensure, unsound};
 use crate::scene::Body;
 use crate::shape::{CellPlace, PointId};
 use palpate_haptics::{ContactState, Tip, TipShape};
@@ -73,16 +73,13 @@ const MAX_DEEPENING: f64 = 0.05;
 /// The cosine between the outward normal of a sample and the direction from which a tip may press it.
 const FACING: f64 = 0.1;
 
-/// Bound of a length, m, and of an energy, J, in a snapshot.
-const LARGEST: f64 = 1e30;
-
 /// A sample whose points can move less than this part of what one free point with all of its weight would is as good as fixed,
 /// and the tip does not feel it.
 const FIXED_PART: f64 = 1e-3;
 
 /// A part of the surface near a tip, and the points that it moves with.
 #[derive(Debug)]
-struct Sample {
+struct ContactSample {
     rest_m: DVec3,
     outward: DVec3,
     /// s·A of the whole sample divided by the modulus of the tissue, m.
@@ -105,7 +102,7 @@ struct TouchedPoint {
 
 /// A sample that the tip touches in a substep.
 #[derive(Debug, Clone, Copy)]
-struct Touched {
+struct TouchedSample {
     sample: usize,
     /// Unit vector out of the tip.
     way: DVec3,
@@ -139,7 +136,7 @@ pub(crate) struct TipPress {
 #[derive(Debug, Clone)]
 pub(crate) struct RigidTip {
     tip: Tip,
-    samples: Arc<[Sample]>,
+    samples: Arc<[ContactSample]>,
     nodes: Arc<[TouchedPoint]>,
     around: Option<SamplesPlace>,
     /// s·A of each sample where the tip is, N/m, and the rest position of that place, m, with the modulus of the tissue, Pa;
@@ -160,7 +157,7 @@ pub(crate) struct RigidTip {
     change_n: Vec<DVec3>,
     /// Displacement of each point, m; kept, so that a step allocates nothing.
     displacements_m: Vec<DVec3>,
-    touched: Vec<Touched>,
+    touched: Vec<TouchedSample>,
 }
 
 impl RigidTip {
@@ -208,14 +205,13 @@ impl RigidTip {
         restored.take_samples(model, &Footprint::restored(model, tip.radius_m, &saved.around)?);
         restored.axis = checks.vector(saved.axis)?;
         ensure((restored.axis.length() - 1.0).abs() < 1e-6, "a tool whose axis has no direction")?;
-        let is_sound = |number: f64| (0.0..LARGEST).contains(&number);
-        ensure(is_sound(saved.drawn_back_m) && is_sound(saved.stored_j), "a tool that is drawn back by no length")?;
-        (restored.drawn_back_m, restored.stored_j) = (saved.drawn_back_m, saved.stored_j);
+        (restored.drawn_back_m, restored.stored_j) =
+            (checks.number(saved.drawn_back_m)?, checks.number(saved.stored_j)?);
+        ensure(restored.drawn_back_m.min(restored.stored_j) >= 0.0, "a tool that is drawn back by no length")?;
         for (number, force_n) in &saved.forces_n {
-            let force_n = checks.vector(*force_n)?;
             let of_sample = restored.forces_n.get_mut(*number as usize);
-            ensure(of_sample.is_some(), "a force on a part of the surface that the tissue lacks")?;
-            of_sample.into_iter().for_each(|of_sample| *of_sample = force_n);
+            *of_sample.ok_or_else(|| unsound("a force on a part of the surface that the tissue lacks"))? =
+                checks.vector(*force_n)?;
         }
         restored.cover(model, footprint);
         restored.spread();
@@ -307,29 +303,27 @@ impl RigidTip {
         };
         let nodes: Arc<[TouchedPoint]> = places.iter().map(|place| node(*place)).collect();
         let sample = |sample: &SurfaceSample| {
-            let numbers = sample.cell.points.map(|point| places.binary_search(&place_of(&point)).ok());
-            if numbers.iter().any(Option::is_none) {
-                return None;
-            }
-            let numbers = numbers.map(|number| number.unwrap_or(0) as u32);
+            let number = |point: u32| places.partition_point(|place| *place < place_of(&point)) as u32;
+            let numbers = sample.cell.points.map(number);
             let weights = sample.cell.weights;
             let parts =
                 numbers.iter().zip(&weights).map(|(node, weight)| weight * weight * nodes[*node as usize].inverse_mass);
-            Some(Sample {
+            ContactSample {
                 rest_m: sample.rest_m,
                 outward: sample.outward,
                 relative_stiffness_m: relative_contact_per_m(model, &sample.cell) * sample.area_m2,
                 nodes: numbers,
                 weights,
                 relative_inverse_mass: parts.sum(),
-            })
+            }
         };
-        let samples: Arc<[Sample]> = taken.iter().filter_map(sample).collect();
+        let samples: Arc<[ContactSample]> = taken.iter().map(sample).collect();
         // Forces stay with the parts of the surface that they act on.
         let mut forces_n = vec![DVec3::ZERO; samples.len()];
         let mut stiffness_n_per_m = vec![0.0; samples.len()];
-        let key =
-            |sample: &Sample| (sample.rest_m.to_array().map(f64::to_bits), sample.outward.to_array().map(f64::to_bits));
+        let key = |sample: &ContactSample| {
+            (sample.rest_m.to_array().map(f64::to_bits), sample.outward.to_array().map(f64::to_bits))
+        };
         let numbers: BTreeMap<_, _> = samples.iter().zip(0..).map(|(sample, number)| (key(sample), number)).collect();
         let before = self.forces_n.iter().enumerate().filter(|(_, force_n)| **force_n != DVec3::ZERO);
         for (old, force_n) in before {
@@ -396,7 +390,7 @@ impl RigidTip {
     }
 
     /// Returns the part of a sample that is under the tip.
-    fn part_under(&self, sample: &Sample, anchor_m: DVec3, outward: DVec3, edge_m: f64) -> f64 {
+    fn part_under(&self, sample: &ContactSample, anchor_m: DVec3, outward: DVec3, edge_m: f64) -> f64 {
         let Tip { shape, radius_m, .. } = self.tip;
         if shape == TipShape::Sphere {
             return 1.0;
@@ -513,7 +507,7 @@ impl RigidTip {
             let part = (deep_m / to_core_m).clamp(0.0, LARGEST_PART);
             let stiffness_n_per_m = stiffness_n_per_m / (1.0 - part).powi(2);
             let deep_m = if touches { deep_m - part * part * to_core_m } else { deep_m.min(0.0) };
-            self.touched.push(Touched {
+            self.touched.push(TouchedSample {
                 sample: number,
                 way,
                 deep_m,
@@ -602,21 +596,15 @@ fn spacing_m(radius_m: f64, edge_m: f64) -> f64 {
     (SPACING * radius_m).min(edge_m)
 }
 
-/// Adds to u and d of points the effect of forces divided by their masses, with the factors `[of_u, of_d]`.
+/// Adds to u and d of points the effect of forces divided by their masses, with the factors `of` for u and d.
 fn push<'n, T: Real>(
     forces: impl Iterator<Item = (&'n TouchedPoint, DVec3)>,
     scale: f64,
-    [of_u, of_d]: [f64; 2],
+    of: [f64; 2],
     layout: &Layout,
     state: &mut State<T>,
 ) {
     for (node, force_n) in forces.filter(|(node, force_n)| node.inverse_mass > 0.0 && *force_n != DVec3::ZERO) {
-        let [i, j] = node.point;
-        for c in 0..3 {
-            let at = c * layout.plane + i * layout.stride + j;
-            let change = scale * force_n[c];
-            state.u[at] += T::of(of_u * change);
-            state.d[at] += T::of(of_d * change);
-        }
+        state.add(layout, node.point, (scale * force_n).to_array(), of);
     }
 }
