@@ -338,6 +338,7 @@ async fn a_command_wakes_a_session_at_the_step_that_is_next() {
 async fn a_lease_lapses_at_rest_at_its_step() {
     let server = TestServer::start(&["--threads", "1"]);
     let session = server.paper(false).await;
+    rested(&server, &session).await;
     let mut touch =
         TestTouch::open(&server, pb::TouchOpen { lease_s: Some(0.1), ..open(&session, &[0]) }).await.unwrap();
     let opened = touch.opened.take().unwrap();

@@ -227,17 +227,25 @@ impl Intake {
 
     /// Ends the leases that have expired at `now_ns`, ns, as [`Intake::release`] does, and frees some discarded
     /// commands. In a resting session it also advances the next step to that time, but never past a step for which
-    /// something waits. Most functions with a `now_ns` call it.
+    /// something waits; a lease ends there at the step of its own time, however late this is called. Most functions
+    /// with a `now_ns` call it.
     pub fn release_expired(&mut self, now_ns: u64) {
+        while let Some((tool, expires_ns)) = self.leases.take_expired(now_ns) {
+            self.advance_rest(expires_ns);
+            self.end(tool);
+        }
+        self.advance_rest(now_ns);
+        if self.queue.has_left_over() {
+            self.give_back();
+        }
+    }
+
+    /// Advances the next step of a resting session to the one after `now_ns`, ns, or to the first for which something
+    /// waits.
+    fn advance_rest(&mut self, now_ns: u64) {
         if let Some((schedule, until)) = &self.resting {
             let until = self.first_waiting().map_or(*until, |step| step.min(*until));
             self.next_step = self.next_step.max(schedule.next_step(now_ns).min(until));
-        }
-        while let Some(tool) = self.leases.take_expired(now_ns) {
-            self.end(tool);
-        }
-        if self.queue.has_left_over() {
-            self.give_back();
         }
     }
 

@@ -160,12 +160,14 @@ impl Leases {
         self.held.clear();
     }
 
-    /// Removes and returns a tool whose lease has expired at `now_ns`, if there is one, and counts it.
-    pub(super) fn take_expired(&mut self, now_ns: u64) -> Option<u32> {
-        let tool = self.held.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0)?;
+    /// Removes and returns the tool whose lease expired first, with the time of that, ns, if it is at most `now_ns`,
+    /// and counts it. Of several, the one with the lowest number is first.
+    pub(super) fn take_expired(&mut self, now_ns: u64) -> Option<(u32, u64)> {
+        let expired = self.held.iter().map(|(tool, lease)| (*tool, lease.expires_ns));
+        let (tool, expires_ns) = expired.min_by_key(|lease| lease.1).filter(|lease| lease.1 <= now_ns)?;
         self.held.remove(&tool);
         self.expired += 1;
-        Some(tool)
+        Some((tool, expires_ns))
     }
 
     /// Returns the time at which the first lease expires, ns.

@@ -75,6 +75,16 @@ fn a_lease_expires_at_rest_and_what_is_wanted_earlier_comes_first() {
 }
 
 #[test]
+fn a_lease_expires_at_the_step_of_its_time_however_late_it_is_noticed() {
+    let (mut intake, schedule) = intake();
+    intake.rest(0, u64::MAX, &schedule);
+    intake.acquire(&[3], "", 0.2, 2, 20 * MS).unwrap();
+    intake.acquire(&[1], "", 0.1, 3, 30 * MS).unwrap();
+    intake.release_expired(500 * MS);
+    assert_eq!((intake.expired(), steps(&intake), intake.next_step()), (2, vec![131, 131], 131));
+}
+
+#[test]
 fn renewing_wakes_nobody() {
     let (mut intake, schedule) = intake();
     intake.rest(0, u64::MAX, &schedule);
