@@ -82,7 +82,8 @@ fn push(tissue: &mut dyn Tissue, force_n: DVec3) {
 
 #[test]
 fn a_solid_that_nothing_damps_keeps_its_energy() {
-    let sets = ["material.damping_per_s=0", "stepping.substeps=16", "stepping.precision=\"f64\""];
+    let undamped = ["material.damping_per_s=0", "material.viscosity_pa_s=0"];
+    let sets = [&undamped[..], &["stepping.substeps=16", "stepping.precision=\"f64\""]].concat();
     let mut tissue = at_rest(&small("", &sets));
     push(&mut *tissue, DVec3::new(0.1, 0.05, -0.2));
     (0..200).for_each(|_| tissue.step().unwrap());
@@ -104,9 +105,14 @@ fn a_solid_that_nothing_damps_keeps_its_energy() {
 
 #[test]
 fn every_scheme_steps_a_solid_and_its_bits_are_those_of_every_width() {
-    for scheme in common::schemes() {
+    let schemes = common::schemes().chain(["stormer"]).flat_map(|scheme| [(scheme, 0.0), (scheme, 0.1)]);
+    for (scheme, viscosity_pa_s) in schemes.filter(|of| *of != ("rk4", 0.1)) {
         let hash = |lanes: &str| {
-            let set = [format!("stepping.integrator=\"{scheme}\""), format!("stepping.lanes=\"{lanes}\"")];
+            let set = [
+                format!("stepping.integrator=\"{scheme}\""),
+                format!("stepping.lanes=\"{lanes}\""),
+                format!("material.viscosity_pa_s={viscosity_pa_s}"),
+            ];
             let mut tissue = at_rest(&small("", &set.each_ref().map(String::as_str)));
             push(&mut *tissue, DVec3::new(0.1, 0.05, -0.2));
             (0..100).for_each(|_| tissue.step().unwrap());
@@ -115,6 +121,74 @@ fn every_scheme_steps_a_solid_and_its_bits_are_those_of_every_width() {
             tissue.state_hash()
         };
         assert_eq!(hash("plain"), hash("auto"), "{scheme}");
+    }
+}
+
+/// All schemes step the same viscous solid: the finer, the nearer they are to each other.
+#[test]
+fn a_viscous_solid_moves_the_same_with_every_scheme() {
+    let course = |scheme: &str, substeps: u32| {
+        let sets = [
+            format!("stepping.integrator=\"{scheme}\""),
+            format!("stepping.substeps={substeps}"),
+            "stepping.precision=\"f64\"".to_owned(),
+            "material.viscosity_pa_s=3".to_owned(),
+        ];
+        let mut tissue = at_rest(&small("", &sets.each_ref().map(String::as_str)));
+        push(&mut *tissue, DVec3::new(0.1, 0.05, -0.2));
+        let place_m = DVec3::new(0.03, 0.03, 0.03);
+        let moved_m = |_| {
+            tissue.step().unwrap();
+            tissue.surface_displacement_m(place_m)
+        };
+        (0..60).map(moved_m).collect::<Vec<DVec3>>()
+    };
+    let truth = course("exponential4", 64);
+    let largest_m = truth.iter().map(|u| u.length()).fold(0.0, f64::max);
+    let error = |scheme: &str, substeps: u32| {
+        let course = course(scheme, substeps);
+        let off_m = course.iter().zip(&truth).map(|(found, truth)| found.distance(*truth)).fold(0.0, f64::max);
+        off_m / largest_m
+    };
+    for (scheme, order, within) in
+        [("central", 2, 2e-3), ("stormer", 2, 2e-3), ("exponential2", 3, 2e-4), ("exponential3", 4, 2e-5)]
+    {
+        let [coarse, fine] = [16, 32].map(|substeps| error(scheme, substeps));
+        println!("{scheme}: {coarse:.1e} {fine:.1e}");
+        assert!(coarse < within && fine < 1.25 * coarse / 2_f64.powi(order), "{scheme}: {coarse:e} {fine:e}");
+    }
+}
+
+/// The force of a viscous tissue that moves includes that of the rate: τ times the rate at which the force of rest changes.
+#[test]
+fn a_finger_that_moves_feels_the_viscosity() {
+    const SPEED_M_PER_S: f64 = 0.002;
+    let felt_n = |viscosity_pa_s: f64, scheme: &str| {
+        let sets = [
+            format!("material.viscosity_pa_s={viscosity_pa_s}"),
+            format!("stepping.integrator=\"{scheme}\""),
+            "stepping.substeps=24".to_owned(),
+        ];
+        let mut tissue = at_rest(&small("", &sets.each_ref().map(String::as_str)));
+        let press = |tissue: &mut dyn Tissue, steps: std::ops::Range<i32>, moves: bool| {
+            for step in steps {
+                let depth_m = 1e-3 * SPEED_M_PER_S * f64::from(if moves { step } else { 500 });
+                tissue.pose(0, DVec3::new(0.03, 0.03, 0.0301 - depth_m), Tip::default());
+                tissue.step().unwrap();
+            }
+            tissue.tool_contact(0).unwrap().force_on_tool_n.z
+        };
+        let moving_n = press(&mut *tissue, 0..501, true);
+        [moving_n, press(&mut *tissue, 500..1500, false)]
+    };
+    for scheme in ["central", "stormer", "exponential2", "exponential4"] {
+        let ([elastic_n, rest_n], [viscous_n, other_rest_n]) = (felt_n(0.0, scheme), felt_n(3.0, scheme));
+        assert!((other_rest_n / rest_n - 1.0).abs() < 1e-3, "{scheme}: {rest_n} {other_rest_n}");
+        let stiffness_n_per_m = rest_n / (SPEED_M_PER_S * 0.5 - 1e-4);
+        let viscous_time_s = 3.0 / (8e3 / 2.9);
+        let ratio = (viscous_n - elastic_n) / (viscous_time_s * stiffness_n_per_m * SPEED_M_PER_S);
+        println!("{scheme}: {elastic_n} {viscous_n} {rest_n}, {ratio} of what the rate says");
+        assert!((0.9..1.1).contains(&ratio), "{scheme}: {ratio}");
     }
 }
 

@@ -17,8 +17,8 @@ use glam::DVec3;
 use palpate_haptics::{Tip, TipShape};
 use palpate_tissue::guard::INTERVAL_SUBSTEPS;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::{Integrator, Named, Scene};
 use palpate_tissue::{self as tissue, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
@@ -352,7 +352,7 @@ fn abused(seed: u64) -> Option<[u64; 2]> {
 #[test]
 fn strong_damping_alone_lets_no_scheme_grow() {
     let held = RandomAction { step: 0, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, 0.77], manner: 1 };
-    for (integrator, _) in Integrator::NAMES {
+    for integrator in ["auto"].into_iter().chain(common::schemes()) {
         for damping in [0.2, 0.7, 0.75, 1.4, 6.0, 25.0] {
             let text = format!(
                 "[sheet]\npoints = [3, 7]\nspacing_m = 1.0\npoint_mass_kg = 2.5e-4\nfixed = []\n\

@@ -2532,6 +2532,11 @@ pub struct Solid {
     /// the one before. At most 8.
     #[prost(message, repeated, tag = "9")]
     pub layers: ::prost::alloc::vec::Vec<Layer>,
+    /// η, viscosity (Kelvin–Voigt), Pa·s; 0 or more. All stress is that of the strain plus η/μ times its rate, with μ the shear
+    /// modulus; where E is larger, so is the viscosity. If absent 0.1, but η/μ at
+    /// most 36 µs.
+    #[prost(double, optional, tag = "10")]
+    pub viscosity_pa_s: ::core::option::Option<f64>,
 }
 impl ::prost::Name for Solid {
     const NAME: &'static str = "Solid";
@@ -2775,8 +2780,8 @@ pub struct Stepping {
     /// Allowed error of displacement and force, relative to their largest; if absent 1e-5, of a solid 1e-2.
     #[prost(double, optional, tag = "2")]
     pub tolerance: ::core::option::Option<f64>,
-    /// "auto" (the cheapest that keeps the tolerance), "central", "lagged", "rk4", "exponential2", "exponential3" or
-    /// "exponential4"; "auto" if empty.
+    /// "auto" (the cheapest that keeps the tolerance), "central", "lagged", "rk4", "exponential2", "exponential3",
+    /// "exponential4" or (of a solid) "stormer"; "auto" if empty.
     #[prost(string, tag = "3")]
     pub integrator: ::prost::alloc::string::String,
     /// Number of substeps per step; chosen from the stability bound if absent.

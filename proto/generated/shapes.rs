@@ -393,6 +393,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 9, is_list: true, kind: FieldKind::Message(56) },
+Field { number: 10, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.Layer", bytes: size_of::<crate::pb::Layer>(), decode: |bytes| <crate::pb::Layer as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },

@@ -185,13 +185,21 @@ pub fn solid_case(seed: u64) -> RandomScene {
     };
     let others = mesh.triangles.iter().find(|triangle| triangle.contains(&(vertex as u32)));
     let watched: Vec<u32> = others.into_iter().flatten().copied().collect();
+    // A third is elastic, a third has the usual viscosity, and of a third τ times the fastest vibration is 0.001 to 1.
+    let turn_by_viscosity = 10_f64.powf(-3.0 * fastrand::Rng::with_seed(!seed).f64());
+    let viscosity_pa_s = match seed % 3 {
+        0 => Some(0.0),
+        1 => None,
+        _ => Some(1e-3 * turn_by_viscosity / turn * 0.5 * youngs_pa / (1.0 + poissons_ratio)),
+    };
+    let viscosity = viscosity_pa_s.map_or(String::new(), |value| format!("viscosity_pa_s = {value:?}\n"));
     RandomScene {
         mesh: Some(mesh.obj()),
         scene: format!(
             "name = \"random {seed}\"\n[solid]\nfile = \"mesh.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
              fixed = [{{ plane_m = [0, 0, {plane_m:?}], normal = [0, 0, 1], within_m = {:?} }}]\n\
              [material]\nyoungs_modulus_pa = {youngs_pa:?}\npoissons_ratio = {poissons_ratio:?}\n\
-             damping_per_s = {damping_per_s:?}\n{lump}",
+             damping_per_s = {damping_per_s:?}\n{viscosity}{lump}",
             0.2 * z.1
         ),
         about: format!(

@@ -115,9 +115,13 @@ pub fn check_replays(header: &pb::Header) -> Result<()> {
 /// unknown name, and values outside the limits or that no tissue has.
 pub fn model(header: &pb::Header, given: &Limits) -> Result<Arc<Model>> {
     let limits = limits(given);
-    let message = required("scene", header.scene.as_ref())?;
+    let mut message = required("scene", header.scene.as_ref())?.clone();
+    if let Some(solid) = &mut message.solid {
+        // A journal from before solids were viscous.
+        solid.viscosity_pa_s.get_or_insert(0.0);
+    }
     let beside = header.mesh.as_ref().map(|mesh| from_mesh(mesh, &limits)).transpose()?;
-    let mut scene = from_scene(message, beside.as_ref()).map_err(|refusal| refusal.within("scene"))?;
+    let mut scene = from_scene(&message, beside.as_ref()).map_err(|refusal| refusal.within("scene"))?;
     if let Some(appearance) = &header.appearance {
         scene.appearance = from_appearance(appearance)?;
     }

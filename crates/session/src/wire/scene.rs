@@ -173,7 +173,9 @@ fn from_solid(message: &pb::Scene, of_solid: &pb::Solid, mesh: &TriangleMesh) ->
         poissons_ratio: required("solid.poissons_ratio", of_solid.poissons_ratio)?,
         density_kg_per_m3: of_solid.density_kg_per_m3.unwrap_or(usual.density_kg_per_m3),
         damping_per_s: of_solid.damping_per_s.unwrap_or(usual.damping_per_s),
+        ..usual
     };
+    let material = material.with_viscosity(of_solid.viscosity_pa_s);
     let size = match (of_solid.cell_m, of_solid.cells) {
         (Some(cell_m), _) => CellSize::Edge(positive("solid.cell_m", cell_m)?),
         (None, Some(cells)) => CellSize::Count(f64::from(cells)),
@@ -448,6 +450,7 @@ fn solid(solid: &Solid) -> pb::Solid {
         poissons_ratio: Some(solid.material.poissons_ratio),
         density_kg_per_m3: Some(solid.material.density_kg_per_m3),
         damping_per_s: Some(solid.material.damping_per_s),
+        viscosity_pa_s: Some(solid.material.viscosity_pa_s),
         layers: solid.layers().iter().map(layer).collect(),
     }
 }

@@ -92,8 +92,7 @@ impl Plan {
     /// Creates a plan without checking its stability; a rehearsal detects an instability itself.
     pub(crate) fn unjudged(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let substep_s = step_s / f64::from(substeps);
-        let (a, g) = sheet.scaled(substep_s);
-        let scheme = Scheme::fit(integrator, a, g);
+        let scheme = Scheme::fit(integrator, sheet.scaled(substep_s));
         let nodes = scheme.nodes();
         Plan { integrator, substeps, substep_s, scheme, nodes, stable: true }
     }
@@ -129,6 +128,7 @@ impl Oscillator {
             damping_n_s_per_m: scene.damping_n_s_per_m + 0.0,
             anchor_stiffness_n_per_m: scene.anchor_stiffness_n_per_m + 0.0,
             spring_stiffness_n_per_m: stability::largest_stiffness_n_per_m(scene),
+            viscous_time_s: scene.body.kind().viscous_time_s(),
         }
     }
 }

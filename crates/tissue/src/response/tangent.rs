@@ -141,7 +141,7 @@ pub struct Tangent {
     /// S = (Eᵀ K⁻¹ E)⁻¹, with the weights E of the disc and the tangent stiffness K of the tissue, N/m. 0 if no point
     /// under the disc can move.
     pub stiffness_n_per_m: DMat3,
-    /// B = C·φ̂ᵀφ̂ of movements with the tissue, φ̂ = K⁻¹·E·S, N·s/m.
+    /// B = C·φ̂ᵀφ̂ + τ·S of movements with the tissue, φ̂ = K⁻¹·E·S, with τ of a viscous tissue, N·s/m.
     pub damping_n_s_per_m: DMat3,
     /// D = C·Σ ∂u·∂u of sliding within the surface, with ∂u the slope of the displacements, N·s/m: the mean of both
     /// directions.
@@ -322,7 +322,7 @@ impl<'m> LinearPatch<'m> {
         let scene = &self.model.scene;
         Tangent {
             stiffness_n_per_m,
-            damping_n_s_per_m: scene.damping_n_s_per_m * unit,
+            damping_n_s_per_m: scene.damping_n_s_per_m * unit + scene.body.kind().viscous_time_s() * stiffness_n_per_m,
             drag_n_s_per_m: scene.damping_n_s_per_m
                 * self.window.slopes(self.model, self.elements.springs(), &self.masses, &self.displacement_m),
             mass_kg: scene.point_mass_kg() * unit.z_axis.z,

@@ -233,6 +233,16 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         1.0
     }
 
+    /// Returns the cost of a substep of a scheme relative to `central`, where `of_sweeps` is that with the springs of the paper.
+    fn scheme_cost(&self, of_sweeps: f64) -> f64 {
+        of_sweeps
+    }
+
+    /// Returns τ of the springs, s: their force is N + τ·Ṅ, with N the elastic force.
+    fn viscous_time_s(&self) -> f64 {
+        0.0
+    }
+
     /// Returns the largest measured factor by which the true error of a script may exceed that of a rehearsal.
     fn rehearsal_margin(&self) -> f64;
 

@@ -370,7 +370,7 @@ macro_rules! named {
 named! {
     /// The schemes that advance the points in time (see the module `scheme`).
     pub enum Integrator {
-        /// Palpate chooses, among `central` and the exponential schemes.
+        /// Palpate chooses, among `central` (of a viscous tissue `stormer`) and the exponential schemes.
         Auto = "auto",
         /// Central differences, damping implicit: second order.
         Central = "central",
@@ -384,6 +384,16 @@ named! {
         Exponential3 = "exponential3",
         /// Exponential multistep with the last 4 forces of the springs: fifth order.
         Exponential4 = "exponential4",
+        /// Central differences with the springs' last 2 forces: second order, with a smaller error than `central`. For tissue
+        /// without anchor springs.
+        Stormer = "stormer",
+    }
+}
+
+impl Integrator {
+    /// Returns whether the integrator steps tissue with anchor springs.
+    pub fn takes_anchor_springs(self) -> bool {
+        self != Integrator::Stormer
     }
 }
 
@@ -644,6 +654,7 @@ impl Scene {
             return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
         }
         let stepping = &self.stepping;
+        self.check_integrator()?;
         number("stepping.rate_hz", stepping.rate_hz, "from 1e-3 to 1e7", |v| (1e-3..=1e7).contains(&v))?;
         number("stepping.tolerance", stepping.tolerance, "above 0 and at most 1", |v| v > 0.0 && v <= 1.0)?;
         if let Some(substeps) = stepping.substeps {
@@ -655,6 +666,20 @@ impl Scene {
             number("sleep.tolerance", tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         }
         Ok(())
+    }
+
+    /// Refuses an integrator that leaves out a property of the tissue.
+    fn check_integrator(&self) -> Result<()> {
+        let message = match self.stepping.integrator {
+            integrator if !(integrator.takes_anchor_springs() || matches!(self.body, Body::Solid(_))) => {
+                "stormer is for [solid], which has no anchor springs"
+            }
+            Integrator::Rk4 if self.body.kind().viscous_time_s() > 0.0 => {
+                "rk4 leaves viscosity out: take another, or set material.viscosity_pa_s to 0"
+            }
+            _ => return Ok(()),
+        };
+        Err(Refusal::new(Reason::WrongKind, "stepping.integrator", message))
     }
 }
 

@@ -37,7 +37,7 @@ const MAX_POISSON: f64 = 0.495;
 /// Places along each side of a cube at which an inclusion's factor is looked up.
 const LOOKS: usize = 4;
 
-/// The material of a solid: elastic, of one density, damped in proportion to its mass.
+/// The material of a solid: of one density, damped in proportion to its mass and to its stiffness.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SolidMaterial {
     /// Young's modulus E, Pa.
@@ -48,15 +48,24 @@ pub struct SolidMaterial {
     pub density_kg_per_m3: f64,
     /// Damping: the force −c·m·v on a mass m, 1/s.
     pub damping_per_s: f64,
+    /// Viscosity η, Pa·s (Kelvin–Voigt): stress follows strain and its rate as if every modulus E were E·(1 + τ·d/dt), with
+    /// τ = η/μ. In shear η resists the rate of the angle.
+    pub viscosity_pa_s: f64,
 }
 
 impl SolidMaterial {
     /// Message of the refusal of a coefficient beside the material ([`Reason::WrongKind`]).
     pub const FOLLOWS: &str = "does not go with [solid], whose [material] gives it";
 
-    /// Returns a material of usual soft tissue, to start from: 8 kPa, ν 0.45, 1060 kg/m³, damping of 20/s.
+    /// Returns a material of usual soft tissue, to start from: 8 kPa, ν 0.45, 1060 kg/m³, damping of 20/s, 0.1 Pa·s.
     pub fn usual() -> Self {
-        SolidMaterial { youngs_modulus_pa: 8e3, poissons_ratio: 0.45, density_kg_per_m3: 1060.0, damping_per_s: 20.0 }
+        SolidMaterial {
+            youngs_modulus_pa: 8e3,
+            poissons_ratio: 0.45,
+            density_kg_per_m3: 1060.0,
+            damping_per_s: 20.0,
+            viscosity_pa_s: 0.1,
+        }
     }
 
     pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
@@ -66,9 +75,25 @@ impl SolidMaterial {
             poissons_ratio: fields.required_number("poissons_ratio")?,
             density_kg_per_m3: fields.number("density_kg_per_m3")?.unwrap_or(usual.density_kg_per_m3),
             damping_per_s: fields.number("damping_per_s")?.unwrap_or(usual.damping_per_s),
+            ..usual
         };
+        let material = material.with_viscosity(fields.number("viscosity_pa_s")?);
         material.check()?;
         Ok(material)
+    }
+
+    /// Returns the material with a viscosity, Pa·s. `None` is the usual one: 0.1 Pa·s, or so much that η/μ is 36 µs if that is less,
+    /// so that it does not damp what cells show well.
+    pub fn with_viscosity(self, viscosity_pa_s: Option<f64>) -> Self {
+        let usual = Self::usual();
+        let shear_pa = self.youngs_modulus_pa * self.shear_over_youngs();
+        let by_default = || usual.viscosity_pa_s.min(usual.viscous_time_s() * shear_pa);
+        SolidMaterial { viscosity_pa_s: viscosity_pa_s.unwrap_or_else(by_default), ..self }
+    }
+
+    /// Returns η/μ, s.
+    fn viscous_time_s(&self) -> f64 {
+        self.viscosity_pa_s / (self.youngs_modulus_pa * self.shear_over_youngs())
     }
 
     fn check(&self) -> Result<()> {
@@ -81,6 +106,7 @@ impl SolidMaterial {
         let holds = |v| (0.0..=MAX_POISSON).contains(&v);
         number("material.poissons_ratio", self.poissons_ratio, "from 0 to 0.495", holds)?;
         not_negative("material.damping_per_s", self.damping_per_s)?;
+        not_negative("material.viscosity_pa_s", self.viscosity_pa_s)?;
         Ok(())
     }
 
@@ -343,7 +369,10 @@ impl BodyKind for Solid {
     fn identify(&self, _order: &[u32], add: &mut dyn FnMut(&[u8])) {
         add(b"solid");
         let Lattice { origin_m, edge_m, cells } = *self.shape.lattice();
-        for number in origin_m.to_array().into_iter().chain([edge_m, self.material.poissons_ratio]) {
+        let SolidMaterial { poissons_ratio, viscosity_pa_s, .. } = self.material;
+        // Snapshots of elastic solids are older.
+        let viscosity = (viscosity_pa_s > 0.0).then_some(viscosity_pa_s);
+        for number in origin_m.to_array().into_iter().chain([edge_m, poissons_ratio]).chain(viscosity) {
             add(&number.to_bits().to_le_bytes());
         }
         cells.iter().for_each(|count| add(&(*count as u64).to_le_bytes()));
@@ -398,6 +427,15 @@ impl BodyKind for Solid {
 
     /// A rehearsal pushes points of a small block, and a whole solid also has slower vibrations. (108 random solids at two
     /// tolerances: at most 4.1 times, half of them 0.07 times.)
+    /// A cube's law costs as much with every scheme.
+    fn scheme_cost(&self, of_sweeps: f64) -> f64 {
+        1.0 + (of_sweeps - 1.0) / self.relative_cost()
+    }
+
+    fn viscous_time_s(&self) -> f64 {
+        self.material.viscous_time_s()
+    }
+
     fn rehearsal_margin(&self) -> f64 {
         5.0
     }

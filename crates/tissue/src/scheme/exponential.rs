@@ -16,6 +16,8 @@
 //!
 //! y*₊ = E·y* + (E·γ + a₀)·N₀ + Σ (aᵢ − e_{i−1}·E·γ)·N₋ᵢ + forced,  i = 1 … p,  a_p = 0:
 //!
+//! A viscous tissue's springs pull with N + β·Ṅ: the polynomials through N are those of N + β·Ṅ in both integrals.
+//!
 //! This takes one pass, in place, without a buffer for predictions. u and w advance by increments, with E − 1 formed in
 //! f64, so f32 keeps its digits.
 //!
@@ -29,6 +31,7 @@
 use super::arithmetic::{Arithmetic, MAX_KEPT};
 use super::family::{Family, QuadratureNode, Release};
 use super::matrix::Matrix;
+use super::oscillator::Coefficients;
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
@@ -66,14 +69,22 @@ fn basis(one: f64, roots: impl Iterator<Item = f64>) -> Vec<f64> {
     })
 }
 
+/// Returns N + β·Ṅ for N a polynomial in s, in rising powers.
+#[allow(clippy::cast_precision_loss)]
+fn viscous(polynomial: &[f64], viscosity: f64) -> Vec<f64> {
+    let rate = polynomial.iter().enumerate().skip(1).map(|(power, coefficient)| power as f64 * coefficient);
+    polynomial.iter().zip(rate.chain([0.0])).map(|(coefficient, rate)| coefficient + viscosity * rate).collect()
+}
+
 /// Returns ∫ e^{A(1−s)}·b·polynomial(s) ds.
 fn integral(moments: &[[f64; 2]], polynomial: &[f64]) -> [f64; 2] {
     std::array::from_fn(|row| polynomial.iter().zip(moments).map(|(c, moment)| c * moment[row]).sum())
 }
 
-/// Fits the scheme to a = K″·dt²/m and g = C·dt/m.
+/// Fits the scheme to a tissue and a substep.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn fit<const ORDER: usize>(a: f64, g: f64) -> Multistep<ORDER> {
+pub(super) fn fit<const ORDER: usize>(of: Coefficients) -> Multistep<ORDER> {
+    let Coefficients { anchor: a, damping: g, viscosity } = of;
     // y′ = A·y + b·c₀, cⱼ′ = cⱼ₊₁: starting from c = the j-th unit vector, c₀ is sʲ/j!, and y(1) is its integral.
     let powers = ORDER + 1;
     let system = Matrix::of(2 + powers, |i, j| match (i, j) {
@@ -95,10 +106,11 @@ pub(super) fn fit<const ORDER: usize>(a: f64, g: f64) -> Multistep<ORDER> {
     // Values are at s = 0, −1, …, 1 − p.
     let nodes = || (0..ORDER).map(|i| -(i as f64));
     let through: Vec<Vec<f64>> = nodes().map(|node| basis(node, nodes().filter(move |other| *other != node))).collect();
-    let predictor: Vec<[f64; 2]> = through.iter().map(|polynomial| integral(&moments, polynomial)).collect();
+    let pulls = |polynomial: &[f64]| integral(&moments, &viscous(polynomial, viscosity));
+    let predictor: Vec<[f64; 2]> = through.iter().map(|polynomial| pulls(polynomial)).collect();
     // A polynomial's value at s = 1 is the sum of its coefficients.
     let extrapolation: Vec<f64> = through.iter().map(|polynomial| polynomial.iter().sum()).collect();
-    let correction = integral(&moments, &basis(1.0, nodes()));
+    let correction = pulls(&basis(1.0, nodes()));
     let carried: [f64; 2] = std::array::from_fn(|row| {
         correction[row]
             + (0..2)
@@ -209,13 +221,24 @@ impl<const ORDER: usize> Family for Multistep<ORDER> {
 
     fn resample(&self, to: &Self, ratio: f64, [u, d]: [f64; 2], _: f64, springs: &mut [f64]) -> [f64; 2] {
         let [du, dw] = self.correction.map(|weight| weight * self.prediction_error(springs));
-        #[allow(clippy::cast_precision_loss)]
-        let shorter: Vec<f64> =
-            (0..springs.len()).map(|i| ratio * ratio * through(springs, -(i as f64) * ratio)).collect();
-        springs.copy_from_slice(&shorter);
+        resample_history(springs, ratio);
         let foretold = to.correction.map(|weight| weight * to.prediction_error(springs));
         [u + du - foretold[0], (d + dw) * ratio - foretold[1]]
     }
+}
+
+/// Returns the weights of `count` values now, a substep ago, …, in the rate at which the polynomial through them changes now.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn rate_weights(count: usize) -> Vec<f64> {
+    let nodes = || (0..count).map(|i| -(i as f64));
+    nodes().map(|node| basis(node, nodes().filter(move |other| *other != node))).map(|weight| weight[1]).collect()
+}
+
+/// Converts forces now and in substeps before to those of a substep that is `ratio` times as long, in its unit.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn resample_history(springs: &mut [f64], ratio: f64) {
+    let shorter: Vec<f64> = (0..springs.len()).map(|i| ratio * ratio * through(springs, -(i as f64) * ratio)).collect();
+    springs.copy_from_slice(&shorter);
 }
 
 /// Returns the value at `s` of the polynomial that is `values[i]` at −i.
@@ -332,7 +355,7 @@ mod tests {
 
     #[test]
     fn a_point_that_is_released_goes_on_from_where_the_tool_held_it() {
-        let scheme = fit::<3>(0.02, 0.1);
+        let scheme = fit::<3>(Coefficients { anchor: 0.02, damping: 0.1, viscosity: 0.3 });
         let (held, springs) = ([0.7, -0.2], &SPRINGS[..4]);
         let at = Release { u: held[0], springs, used: 0.0, scale: 1.0, lost_n: 0.0 };
         let [du, dd] = scheme.release(at).unwrap();
@@ -344,7 +367,12 @@ mod tests {
     #[test]
     fn a_state_stands_for_the_same_place_and_velocity_with_another_substep() {
         for ratio in [0.5, 0.25, 1.0] {
-            let (from, to) = (fit::<4>(0.02, 0.1), fit::<4>(0.02 * ratio * ratio, 0.1 * ratio));
+            let of = |ratio: f64| Coefficients {
+                anchor: 0.02 * ratio * ratio,
+                damping: 0.1 * ratio,
+                viscosity: 0.3 / ratio,
+            };
+            let (from, to) = (fit::<4>(of(1.0)), fit::<4>(of(ratio)));
             let (state, mut springs) = ([0.7, -0.2], SPRINGS);
             let before = present(&from, state, &springs);
             let resampled = from.resample(&to, ratio, state, 0.0, &mut springs);

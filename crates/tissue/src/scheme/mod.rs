@@ -2,8 +2,8 @@
 //!
 //! Units in this module: lengths are in spacings h, time in substeps dt. u is a displacement divided by h, d is
 //! (nearly) what a scheme adds to it in a substep, and forces are multiplied by dt²/(m·h). The coefficients of
-//! the equation of motion are then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the
-//! springs and F from the tools. Small numbers stay small and keep their digits in f32.
+//! the equation of motion are then a = K″·dt²/m, g = C·dt/m and β = τ/dt: u̇̇ = N + β·Ṅ − a·u − g·u̇ + F, with N from
+//! the springs and F from the tools. Small numbers stay small and keep their digits in f32.
 
 pub(crate) mod arithmetic;
 mod central;
@@ -16,11 +16,12 @@ mod oscillator;
 mod relaxation;
 mod rk4;
 pub mod stability;
+mod stormer;
 
 pub use central::TwoStep;
 pub use exponential::Multistep;
 pub use family::QuadratureNode;
-pub use oscillator::Oscillator;
+pub use oscillator::{Coefficients, Oscillator};
 pub use relaxation::Relaxation;
 pub use rk4::Rk4;
 
@@ -35,7 +36,9 @@ use matrix::Matrix;
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scheme {
     /// `central` and `lagged`, which differ in their coefficients alone.
-    TwoStep(TwoStep),
+    TwoStep(TwoStep<false>),
+    /// `stormer`, and `central` and `lagged` of a viscous tissue: they keep 2 earlier forces of the springs.
+    LongTwoStep(TwoStep<true>),
     /// The exponential multistep scheme that keeps 2 earlier forces of the springs.
     Exponential2(Multistep<2>),
     /// The exponential multistep scheme that keeps 3 earlier forces of the springs.
@@ -52,6 +55,7 @@ macro_rules! each {
     ($scheme:expr, |$family:ident| $body:expr) => {
         match $scheme {
             $crate::scheme::Scheme::TwoStep($family) => $body,
+            $crate::scheme::Scheme::LongTwoStep($family) => $body,
             $crate::scheme::Scheme::Exponential2($family) => $body,
             $crate::scheme::Scheme::Exponential3($family) => $body,
             $crate::scheme::Scheme::Exponential4($family) => $body,
@@ -83,31 +87,45 @@ pub(crate) struct Entry {
     pub(crate) bound: Bound,
     /// Whether it can compensate the rounding of f32.
     pub(crate) compensates: bool,
-    /// Fits the scheme to a = K″·dt²/m and g = C·dt/m.
-    fit: fn(f64, f64) -> Scheme,
+    fit: fn(Coefficients) -> Scheme,
 }
 
 /// The integrators that `auto` may become, by falling order.
 pub(crate) const CANDIDATES: [Integrator; 4] =
     [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Central];
 
+/// The same of a viscous tissue, which damps what `stormer` does not show well.
+const CANDIDATES_OF_VISCOUS: [Integrator; 4] =
+    [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Stormer];
+
+/// Returns the integrators that `auto` may become for a tissue, by falling order.
+pub(crate) fn candidates(of: &Oscillator) -> [Integrator; 4] {
+    if of.viscous_time_s > 0.0 { CANDIDATES_OF_VISCOUS } else { CANDIDATES }
+}
+
 /// Returns the entry of an integrator in the register.
 pub(crate) fn entry(integrator: Integrator) -> Entry {
-    type Fit = fn(f64, f64) -> Scheme;
+    type Fit = fn(Coefficients) -> Scheme;
     let exponential =
         |order: f64, cost: f64, fit: Fit| Entry { order, cost, bound: Bound::Stable, compensates: true, fit };
     let other = |order: f64, cost: f64, bound: Bound, fit: Fit| Entry { order, cost, bound, compensates: false, fit };
-    let by_central = |bound: Bound| other(2.0, 1.0, bound, |a, g| Scheme::TwoStep(central::fit(a, g)));
+    let by_central = |bound: Bound| other(2.0, 1.0, bound, |of| two_step(of, central::fit(of)));
     match integrator {
         Integrator::Auto => by_central(Bound::Stable),
         Integrator::Central => by_central(Bound::Turn),
-        Integrator::Lagged => other(1.0, 1.0, Bound::TurnAndLag, |a, g| Scheme::TwoStep(lagged_damping::fit(a, g))),
+        Integrator::Lagged => other(1.0, 1.0, Bound::TurnAndLag, |of| two_step(of, lagged_damping::fit(of))),
         // It evaluates the springs four times.
-        Integrator::Rk4 => other(4.0, 4.0, Bound::Stable, |a, g| Scheme::Rk4(Rk4 { a, g })),
-        Integrator::Exponential2 => exponential(3.0, 1.3, |a, g| Scheme::Exponential2(exponential::fit(a, g))),
-        Integrator::Exponential3 => exponential(4.0, 1.4, |a, g| Scheme::Exponential3(exponential::fit(a, g))),
-        Integrator::Exponential4 => exponential(5.0, 1.6, |a, g| Scheme::Exponential4(exponential::fit(a, g))),
+        Integrator::Rk4 => other(4.0, 4.0, Bound::Stable, |of| Scheme::Rk4(Rk4 { a: of.anchor, g: of.damping })),
+        Integrator::Stormer => other(2.0, 1.1, Bound::Stable, |of| Scheme::LongTwoStep(stormer::fit(of))),
+        Integrator::Exponential2 => exponential(3.0, 1.3, |of| Scheme::Exponential2(exponential::fit(of))),
+        Integrator::Exponential3 => exponential(4.0, 1.4, |of| Scheme::Exponential3(exponential::fit(of))),
+        Integrator::Exponential4 => exponential(5.0, 1.6, |of| Scheme::Exponential4(exponential::fit(of))),
     }
+}
+
+/// Returns the scheme of a fitted two-step form: that of an elastic tissue keeps no force.
+fn two_step(of: Coefficients, fitted: TwoStep<true>) -> Scheme {
+    if of.viscosity > 0.0 { Scheme::LongTwoStep(fitted) } else { Scheme::TwoStep(fitted.elastic()) }
 }
 
 /// Returns `to` if it has the same type as `_from`.
@@ -116,17 +134,16 @@ fn like<'t, F: 'static>(_from: &F, to: &'t dyn Any) -> Option<&'t F> {
 }
 
 /// Returns the power p of the substep with which the error of an integrator falls, as dtᵖ: 1 for `lagged`, 2
-/// for `central` (and for `auto`), 4 for `rk4`, 3 to 5 for `exponential2` to `exponential4`.
+/// for `central` (and for `auto`) and `stormer`, 4 for `rk4`, 3 to 5 for `exponential2` to `exponential4`.
 pub fn order(integrator: Integrator) -> f64 {
     entry(integrator).order
 }
 
 impl Scheme {
-    /// Creates an integrator's scheme with coefficients for a = K″·dt²/m and g = C·dt/m
-    /// ([`Oscillator::scaled`]). `auto` gives `central`. Whether it is stable is not checked: see
-    /// [`stability::is_stable`].
-    pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
-        (entry(integrator).fit)(a, g)
+    /// Creates an integrator's scheme with coefficients for a tissue and a substep ([`Oscillator::scaled`]). `auto` gives
+    /// `central`; `rk4` leaves viscosity out. Whether it is stable is not checked: see [`stability::is_stable`].
+    pub fn fit(integrator: Integrator, of: Coefficients) -> Self {
+        (entry(integrator).fit)(of)
     }
 
     /// Returns the number of sweeps over the springs in a substep.
@@ -193,9 +210,15 @@ impl Scheme {
     }
 
     /// Returns how many of the kept fields, from the first, are the springs' forces of earlier substeps, newest
-    /// first: p for the exponential schemes, otherwise 0.
+    /// first: p for the exponential schemes, 2 for a two-step scheme that keeps them, otherwise 0.
     pub fn history(&self) -> usize {
         each!(self, |family| family.history())
+    }
+
+    /// Returns the weights of the springs' force now and of the kept ones, newest first, in β·Ṅ; empty without viscosity.
+    pub(crate) fn viscous_weights(&self, viscosity: f64) -> Vec<f64> {
+        let count = if viscosity > 0.0 && self.history() > 0 { 1 + self.history() } else { 0 };
+        exponential::rate_weights(count).into_iter().map(|weight| viscosity * weight).collect()
     }
 
     /// Returns the matrix that advances (u, d, kept values) by one substep, for a single vibration without
@@ -239,6 +262,10 @@ impl Scheme {
 mod tests {
     use super::*;
 
+    fn elastic(anchor: f64, damping: f64) -> Coefficients {
+        Coefficients { anchor, damping, viscosity: 0.0 }
+    }
+
     #[test]
     fn a_and_the_springs_stiffness_make_the_square_of_the_fastest_turn() {
         let oscillator = Oscillator {
@@ -246,9 +273,11 @@ mod tests {
             damping_n_s_per_m: 0.3,
             anchor_stiffness_n_per_m: 7.0,
             spring_stiffness_n_per_m: 130.0,
+            viscous_time_s: 0.0,
         };
         for substep_s in [1e-4, 1e-3, 0.02] {
-            let ((a, g), z) = (oscillator.scaled(substep_s), oscillator.scaled_spring_stiffness(substep_s));
+            let (of, z) = (oscillator.scaled(substep_s), oscillator.scaled_spring_stiffness(substep_s));
+            let (a, g) = (of.anchor, of.damping);
             let turn = oscillator.omega_bound_per_s() * substep_s;
             assert!((a + z - turn * turn).abs() < 1e-12 * turn * turn);
             assert!((z / a - 130.0 / 7.0).abs() < 1e-12 && (g - 15.0 * substep_s).abs() < 1e-15);
@@ -271,7 +300,7 @@ mod tests {
     fn impulses_and_constant_forces_act_as_on_the_oscillator() {
         for (a, g) in [(0.04, 0.3), (0.5, 0.0), (0.01, 2.0)] {
             for integrator in [Integrator::Exponential2, Integrator::Exponential3, Integrator::Exponential4] {
-                let scheme = Scheme::fit(integrator, a, g);
+                let scheme = Scheme::fit(integrator, elastic(a, g));
                 for (found, truth) in
                     [(scheme.kick(), moved(a, g, 0.0, 1.0)), (scheme.constant(), moved(a, g, 1.0, 0.0))]
                 {
@@ -281,7 +310,7 @@ mod tests {
                 assert_eq!(scheme.impulse(), scheme.constant()[1]);
             }
             // Two-step schemes move a point by what they change its increment by.
-            let central = Scheme::fit(Integrator::Central, a, g);
+            let central = Scheme::fit(Integrator::Central, elastic(a, g));
             assert_eq!((central.kick(), central.constant()), ([1.0 / (1.0 + g / 2.0); 2], central.kick()));
         }
     }

@@ -11,7 +11,8 @@ use crate::kernel::real::Real;
 
 /// The arithmetic of any scheme in one number format, without compensation: observing needs none.
 pub(crate) enum Observer<T: Real> {
-    TwoStep(<TwoStep as Family>::Plain<T>),
+    TwoStep(<TwoStep<false> as Family>::Plain<T>),
+    LongTwoStep(<TwoStep<true> as Family>::Plain<T>),
     Exponential2(<Multistep<2> as Family>::Plain<T>),
     Exponential3(<Multistep<3> as Family>::Plain<T>),
     Exponential4(<Multistep<4> as Family>::Plain<T>),
@@ -23,6 +24,7 @@ macro_rules! with {
     ($observer:expr, |$arithmetic:ident| $body:expr) => {
         match $observer {
             Observer::TwoStep($arithmetic) => $body,
+            Observer::LongTwoStep($arithmetic) => $body,
             Observer::Exponential2($arithmetic) => $body,
             Observer::Exponential3($arithmetic) => $body,
             Observer::Exponential4($arithmetic) => $body,
@@ -41,6 +43,7 @@ impl<T: Real> Observer<T> {
     pub(crate) fn of(scheme: &Scheme) -> Self {
         match scheme {
             Scheme::TwoStep(family) => Observer::TwoStep(family.plain(0)),
+            Scheme::LongTwoStep(family) => Observer::LongTwoStep(family.plain(0)),
             Scheme::Exponential2(family) => Observer::Exponential2(family.plain(0)),
             Scheme::Exponential3(family) => Observer::Exponential3(family.plain(0)),
             Scheme::Exponential4(family) => Observer::Exponential4(family.plain(0)),

@@ -13,13 +13,29 @@ pub struct Oscillator {
     /// λ: an upper bound of the largest eigenvalue of the springs' stiffness under any deformation, N/m
     /// ([`largest_stiffness_n_per_m`](super::stability::largest_stiffness_n_per_m)).
     pub spring_stiffness_n_per_m: f64,
+    /// τ of the springs, s: their force is N + τ·Ṅ with N the elastic force (Kelvin–Voigt); 0 if they are elastic.
+    pub viscous_time_s: f64,
+}
+
+/// The coefficients of the equation of motion, without unit, for a substep of length dt.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Coefficients {
+    /// a = K″·dt²/m.
+    pub anchor: f64,
+    /// g = C·dt/m.
+    pub damping: f64,
+    /// β = τ/dt.
+    pub viscosity: f64,
 }
 
 impl Oscillator {
-    /// Returns a = K″·dt²/m and g = C·dt/m, without unit, for a substep of length dt = `substep_s`, s.
-    pub fn scaled(&self, substep_s: f64) -> (f64, f64) {
-        let a = self.anchor_stiffness_n_per_m * substep_s * substep_s / self.mass_kg;
-        (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
+    /// Returns the coefficients for a substep of length dt = `substep_s`, s.
+    pub fn scaled(&self, substep_s: f64) -> Coefficients {
+        Coefficients {
+            anchor: self.anchor_stiffness_n_per_m * substep_s * substep_s / self.mass_kg,
+            damping: self.damping_n_s_per_m * substep_s / self.mass_kg,
+            viscosity: self.viscous_time_s / substep_s,
+        }
     }
 
     /// Returns the springs' largest stiffness in units of a substep of length dt = `substep_s`, s: (ω·dt)² =

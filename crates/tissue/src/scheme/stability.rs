@@ -89,8 +89,8 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, oscillator: &Oscilla
     let mut substeps = least_substeps(step_s, oscillator);
     let stable = |substeps: u32| {
         let substep_s = step_s / f64::from(substeps);
-        let (a, g) = oscillator.scaled(substep_s);
-        is_stable(&Scheme::fit(integrator, a, g), oscillator.scaled_spring_stiffness(substep_s))
+        let scheme = Scheme::fit(integrator, oscillator.scaled(substep_s));
+        is_stable(&scheme, oscillator.scaled_spring_stiffness(substep_s))
     };
     // All schemes are stable up to dt·ω = 0.3 even without damping, and up to dt·C/m = 2 (`rk4` to 2.785);
     // because of rounding, the test may never succeed.
@@ -133,6 +133,7 @@ mod tests {
     #![allow(clippy::cast_precision_loss)]
     use super::*;
     use crate::scene::{Named, Springs, largest_stiffness_of_a_sheet_n_per_m};
+    use crate::scheme::Coefficients;
 
     /// Every scheme.
     fn all() -> impl Iterator<Item = Integrator> {
@@ -181,12 +182,13 @@ mod tests {
                     damping_n_s_per_m,
                     anchor_stiffness_n_per_m: 5.0,
                     spring_stiffness_n_per_m,
+                    viscous_time_s: 0.0,
                 };
                 for integrator in all() {
                     let grows = |substeps: u32| {
                         let substep_s = 1e-3 / f64::from(substeps);
-                        let (a, g) = oscillator.scaled(substep_s);
-                        !is_stable(&Scheme::fit(integrator, a, g), oscillator.scaled_spring_stiffness(substep_s))
+                        let scheme = Scheme::fit(integrator, oscillator.scaled(substep_s));
+                        !is_stable(&scheme, oscillator.scaled_spring_stiffness(substep_s))
                     };
                     let found = stable_substeps(integrator, 1e-3, &oscillator);
                     let case = format!("{integrator:?} {spring_stiffness_n_per_m} {damping_n_s_per_m}: {found}");
@@ -218,18 +220,45 @@ mod tests {
     #[test]
     fn a_vibration_grows_by_what_its_damping_says() {
         // Of u̇̇ + g·u̇ + (a + z)·u = 0 the slower part of e^{λ}; a scheme of second order errs by its square.
-        for (a, g, z) in [(0.01, 0.02, 0.0), (0.01, 0.02, 0.05), (0.04, 0.5, 0.0), (0.001, 0.1, 0.02)] {
-            let square: f64 = 0.25 * g * g - a - z;
-            let truth = (if square > 0.0 { square.sqrt() } else { 0.0 } - 0.5 * g).exp();
-            for integrator in all() {
+        // With viscosity, of u̇̇ + (g + β·z)·u̇ + (a + z)·u = 0.
+        for (a, g, z, viscosity) in [
+            (0.01, 0.02, 0.0, 0.0),
+            (0.01, 0.02, 0.05, 0.0),
+            (0.04, 0.5, 0.0, 0.0),
+            (0.001, 0.1, 0.02, 0.0),
+            (0.0, 0.02, 0.02, 1.5),
+            (0.0, 0.0, 0.05, 0.4),
+        ] {
+            let damping: f64 = g + viscosity * z;
+            let square: f64 = 0.25 * damping * damping - a - z;
+            let truth = (if square > 0.0 { square.sqrt() } else { 0.0 } - 0.5 * damping).exp();
+            let lacks = |integrator: &Integrator| match integrator {
+                Integrator::Stormer => a > 0.0,
+                Integrator::Rk4 => viscosity > 0.0,
+                _ => false,
+            };
+            for integrator in all().filter(|integrator| !lacks(integrator)) {
                 let within = match integrator {
                     Integrator::Lagged => 3e-2,
                     Integrator::Rk4 => 1e-4,
                     Integrator::Exponential3 | Integrator::Exponential4 => 1e-3,
                     _ => 2e-3,
                 };
-                let found = Scheme::fit(integrator, a, g).growth(z);
-                assert!((found - truth).abs() < within, "{integrator:?} {a} {g} {z}: {found} {truth}");
+                let of = Coefficients { anchor: a, damping: g, viscosity };
+                let found = Scheme::fit(integrator, of).growth(z);
+                assert!((found - truth).abs() < within, "{integrator:?} {a} {g} {z} {viscosity}: {found} {truth}");
+            }
+        }
+    }
+
+    #[test]
+    fn two_step_schemes_are_stable_as_far_as_they_say() {
+        for viscosity in [0.0, 0.1, 0.4, 2.0] {
+            let of = Coefficients { viscosity, ..Coefficients::default() };
+            for (integrator, own) in [(Integrator::Central, 1.0), (Integrator::Stormer, 4.0 / 3.0)] {
+                let (scheme, limit) = (Scheme::fit(integrator, of), 4.0 / (own + 4.0 * viscosity));
+                assert!(is_stable(&scheme, 0.999 * limit), "{integrator:?} {viscosity}");
+                assert!(!is_stable(&scheme, 1.001 * limit), "{integrator:?} {viscosity}");
             }
         }
     }
@@ -241,6 +270,7 @@ mod tests {
             damping_n_s_per_m: 0.0,
             anchor_stiffness_n_per_m: 0.0,
             spring_stiffness_n_per_m: 0.0,
+            viscous_time_s: 0.0,
         };
         for integrator in all() {
             assert_eq!(substeps(integrator, 1e-3, &oscillator), 1, "{integrator:?}");

@@ -103,6 +103,8 @@ struct Truth {
 /// The small tissue and its reference motion.
 pub(crate) struct Rehearsal<'s> {
     scene: Scene,
+    /// The integrator of the reference motion.
+    reference: Integrator,
     /// The points that are compared; the first is pushed.
     looked_at: [PointId; 3],
     sheet: Oscillator,
@@ -119,24 +121,34 @@ pub(crate) struct Rehearsal<'s> {
     stop: &'s AtomicBool,
 }
 
+/// Returns the integrator of the reference motion: that of the highest order; but where viscosity asks for much shorter substeps with it, the
+/// one that needs fewest.
+fn reference(step_s: f64, sheet: &Oscillator) -> Integrator {
+    let substeps = |integrator| stability::stable_substeps(integrator, step_s, sheet);
+    let is_cheap = substeps(Integrator::Exponential4) <= substeps(Integrator::Exponential2).saturating_mul(2);
+    if is_cheap { Integrator::Exponential4 } else { Integrator::Exponential2 }
+}
+
 impl<'s> Rehearsal<'s> {
     /// Creates the rehearsal of a scene, with a reference that is good enough to judge schemes by `tolerance`.
     /// All courses together compute at most `most_work` points × substeps, and nothing more once `stop` is set.
     pub(crate) fn new(scene: &Scene, tolerance: f64, most_work: u64, stop: &'s AtomicBool) -> Self {
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
-        let parts = stability::stable_substeps(Integrator::Exponential4, step_s, &sheet) / SUBSTEPS_A_LOOK;
+        let reference = reference(step_s, &sheet);
+        let parts = stability::stable_substeps(reference, step_s, &sheet) / SUBSTEPS_A_LOOK;
         let parts = parts.min(scene.stepping.substeps.unwrap_or(u32::MAX)).max(1);
         let mut small = scene.clone();
         let (body, looked_at) = scene.body.part(SIDE);
         small.body = body;
         small.stepping.rate_hz = scene.stepping.rate_hz * f64::from(parts);
-        let least = stability::stable_substeps(Integrator::Exponential4, small.stepping.rate_hz.recip(), &sheet);
+        let least = stability::stable_substeps(reference, small.stepping.rate_hz.recip(), &sheet);
         let most_steps = STEPS.1.min(SUBSTEPS / f64::from(least)).max(STEPS.0);
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let steps = (COURSE_S * small.stepping.rate_hz).clamp(STEPS.0, most_steps) as usize;
         let mut rehearsal = Rehearsal {
             scene: small,
+            reference,
             looked_at,
             sheet,
             parts,
@@ -172,18 +184,18 @@ impl<'s> Rehearsal<'s> {
     }
 
     /// Computes the reference: halves the substep until that changes less than the tolerance; an error of fifth
-    /// order is then 32 times smaller. If rounding or a sensitive motion prevents that, the course that changed
+    /// order is then 32 times smaller, one of third order 8 times. If rounding or a sensitive motion prevents that, the course that changed
     /// least is the reference, and this change is its uncertainty.
     fn true_course(&self, load: &CalibrationLoad, least: u32, tolerance: f64) -> Option<Truth> {
         let mut substeps = least;
-        let mut coarse = self.course(load, Integrator::Exponential4, substeps, Precision::F64);
+        let mut coarse = self.course(load, self.reference, substeps, Precision::F64);
         let mut best = None::<Truth>;
         for _ in 0..MAX_HALVINGS {
             substeps = substeps.saturating_mul(2);
             if u64::from(substeps) * self.steps as u64 > MAX_SUBSTEPS {
                 break;
             }
-            let Some(fine) = self.course(load, Integrator::Exponential4, substeps, Precision::F64) else { break };
+            let Some(fine) = self.course(load, self.reference, substeps, Precision::F64) else { break };
             if let Some(coarse) = coarse.replace(fine.clone()) {
                 let uncertainty = self.difference(load, &fine, &coarse);
                 if uncertainty <= tolerance {

@@ -5,9 +5,10 @@ use std::cell::RefCell;
 use std::sync::atomic::AtomicBool;
 
 use crate::limits::Limits;
+use crate::scene::BodyKind;
 use crate::scene::{Integrator, Lanes, Precision, Scene, Stepping};
 use crate::scheme::stability;
-use crate::scheme::{CANDIDATES, Oscillator, entry};
+use crate::scheme::{self, Oscillator, entry};
 use crate::select::calibration::{self, Rehearsal};
 use palpate_refusal::{Reason, Refusal, Result};
 
@@ -25,7 +26,7 @@ pub(crate) const STEP_NS: f64 = 2000.0;
 
 /// Returns the predicted processor time of a point of a scene in a substep, ns.
 pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision: Precision, lanes: Lanes) -> f64 {
-    let scheme = entry(integrator).cost;
+    let scheme = scene.body.kind().scheme_cost(entry(integrator).cost);
     let format = FORMATS.iter().find(|format| format.0 == precision).map_or(1.0, |found| found.1);
     let width = match lanes {
         Lanes::Auto | Lanes::Avx512 => 1.0,
@@ -109,6 +110,7 @@ struct OpenChoice {
 
 /// Makes the choice for a scene from rehearsals.
 struct Chooser<'a> {
+    body: &'a dyn BodyKind,
     stepping: &'a Stepping,
     sheet: Oscillator,
     /// The oscillator without the pressure of a volume, which does not reduce creep.
@@ -156,6 +158,7 @@ impl Chooser<'_> {
         // An error near the smallest that can be distinguished from none is as good as any.
         let aim = stepping.tolerance.max(2.0 * rehearsal.least_error());
         let mut chooser = Chooser {
+            body: scene.body.kind(),
             stepping,
             sheet,
             unpressed,
@@ -191,7 +194,7 @@ impl Chooser<'_> {
     fn integrators(&self) -> impl Iterator<Item = Integrator> + use<> {
         let (asked, compensates) = (self.stepping.integrator, self.stepping.precision == Precision::Compensated);
         let candidates =
-            CANDIDATES.into_iter().filter(move |integrator| !compensates || entry(*integrator).compensates);
+            scheme::candidates(&self.sheet).into_iter().filter(move |of| !compensates || entry(*of).compensates);
         let (named, candidates) =
             if asked == Integrator::Auto { (None, Some(candidates)) } else { (Some(asked), None) };
         named.into_iter().chain(candidates.into_iter().flatten())
@@ -201,7 +204,7 @@ impl Chooser<'_> {
         let step_s = self.stepping.rate_hz.recip();
         // An integrator for comparison has exactly the substeps that it needs.
         let needed =
-            || (!CANDIDATES.contains(&integrator)).then(|| stability::substeps(integrator, step_s, &self.sheet));
+            || self.is_for_comparison(integrator).then(|| stability::substeps(integrator, step_s, &self.sheet));
         if let Some(substeps) = self.stepping.substeps.or_else(needed) {
             return OpenChoice { integrator, least: substeps, most: substeps };
         }
@@ -307,7 +310,12 @@ impl Chooser<'_> {
 
     /// Returns whether the number of substeps is fixed.
     fn is_given(&self, open: &OpenChoice) -> bool {
-        self.stepping.substeps.is_some() || !CANDIDATES.contains(&open.integrator)
+        self.stepping.substeps.is_some() || self.is_for_comparison(open.integrator)
+    }
+
+    /// Returns whether an integrator is none that `auto` may become.
+    fn is_for_comparison(&self, integrator: Integrator) -> bool {
+        !scheme::candidates(&self.sheet).contains(&integrator)
     }
 }
 
@@ -315,7 +323,7 @@ impl Chooser<'_> {
 /// that `auto` may choose). Saturates for absurd scenes.
 pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let is_open = |integrator: Integrator| asked == Integrator::Auto || asked == integrator;
-    let open = CANDIDATES.into_iter().filter(|integrator| is_open(*integrator));
+    let open = scheme::candidates(sheet).into_iter().filter(|integrator| is_open(*integrator));
     let least = open.map(|integrator| stability::stable_substeps(integrator, step_s, sheet)).min();
     least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
 }
@@ -383,12 +391,12 @@ pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choi
     chooser.check_work(limits).map(|()| (choice, limits.rehearsal_work - chooser.rehearsal.left()))
 }
 
-/// Returns the cost of a substep of an integrator in a format, in substeps of `central` in f32.
-fn cost(integrator: Integrator, format_cost: f64) -> f64 {
-    entry(integrator).cost * format_cost
-}
-
 impl Chooser<'_> {
+    /// Returns the cost of a substep of an integrator in a format, in substeps of `central` in f32.
+    fn cost(&self, integrator: Integrator, format_cost: f64) -> f64 {
+        self.body.scheme_cost(entry(integrator).cost) * format_cost
+    }
+
     /// Makes the choice of [`choose`] among some integrators. If one of them alone keeps the tolerance, the
     /// overall choice does too: a thorough search leaves none out.
     fn best(&self, open: &[OpenChoice]) -> Choice {
@@ -415,7 +423,7 @@ impl Chooser<'_> {
                 if !of_this.iter().any(|open| open.0 == format) {
                     continue;
                 }
-                let cost = cost(open.integrator, format_cost);
+                let cost = self.cost(open.integrator, format_cost);
                 // A choice that is not cheaper than the best so far need not be tried.
                 let most = best.as_ref().map_or(u32::MAX, |(least, _)| (least / cost - 1e-9).floor() as u32);
                 let bound = if may_go_beyond { self.most_substeps } else { open.most.min(self.most_substeps) };
@@ -466,7 +474,7 @@ impl Chooser<'_> {
     fn unpredicted(&self, open: &[OpenChoice]) -> Choice {
         let step_s = self.stepping.rate_hz.recip();
         let stable_cost = |integrator: Integrator| {
-            cost(integrator, f64::from(stability::stable_substeps(integrator, step_s, &self.sheet)))
+            self.cost(integrator, f64::from(stability::stable_substeps(integrator, step_s, &self.sheet)))
         };
         let cheapest = open.iter().min_by(|a, b| stable_cost(a.integrator).total_cmp(&stable_cost(b.integrator)));
         // A scene always allows at least one.

@@ -32,6 +32,8 @@ pub(super) struct PointReader<'a, T: Real> {
     pub(super) observer: Observer<f64>,
     /// [`Plan::spring_unit`].
     pub(super) spring_unit: f64,
+    /// [`Scheme::viscous_weights`](crate::scheme::Scheme::viscous_weights).
+    pub(super) viscous_weights: Vec<f64>,
 }
 
 impl<T: Real> PointReader<'_, T> {
@@ -126,7 +128,15 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
             let [u, w, _] = reader.observer.observe(u, d, n, &kept, Some(force));
             found[0][c] = u.0 * model.unit_m;
             found[1][c] = if still { 0.0 } else { w.0 * model.unit_m / plan.substep_s };
-            found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0, state.u[at].wide());
+            // At rest nothing resists.
+            let mut viscous = 0.0;
+            if !still && !reader.viscous_weights.is_empty() {
+                viscous = reader.viscous_weights[0] * n.0;
+                for k in 1..reader.viscous_weights.len() {
+                    viscous += reader.viscous_weights[k] * kept[k - 1].0;
+                }
+            }
+            found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0 + viscous, state.u[at].wide());
         }
         found
     }

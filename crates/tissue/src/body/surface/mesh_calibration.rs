@@ -16,9 +16,9 @@ use crate::kernel::region::Region;
 use crate::kernel::springs::SpringCoefficients;
 use crate::scene::graph::{GraphFault, MeshGraph};
 use crate::scene::{Integrator, Lanes};
-use crate::scheme::Scheme;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::family::Family;
+use crate::scheme::{Coefficients, Scheme};
 
 /// A mesh in free motion in f32, without tools and damping, stepped by the central scheme, all of it awake: for
 /// benchmarks and tests of the kernel.
@@ -81,7 +81,7 @@ pub(super) struct FreeMotion<T: Real> {
 impl<T: Real> FreeMotion<T> {
     pub(super) fn new(slots: MeshSlots, turn: f64, scale: f64, lanes: Lanes) -> Self {
         let (layout, width) = (slots.layout::<T>(), Width::of(lanes));
-        let scheme = Scheme::fit(Integrator::Central, turn * turn, 0.0);
+        let scheme = Scheme::fit(Integrator::Central, Coefficients { anchor: turn * turn, ..Coefficients::default() });
         let mut region = Region::none(&layout);
         (0..slots.tiles()).for_each(|tile| _ = region.awake.add(tile));
         FreeMotion {

@@ -3,6 +3,7 @@
 
 use super::*;
 use crate::scene::PAPER;
+use crate::scheme::CANDIDATES;
 
 fn scene(sets: &[&str]) -> Scene {
     let sets: Vec<String> = ["sheet.points=[5, 4]"].iter().chain(sets).map(|set| (*set).to_owned()).collect();
@@ -35,6 +36,7 @@ fn rounding_in_f32_grows_with_damping_and_with_shorter_substeps_and_is_less_in_b
         damping_n_s_per_m,
         anchor_stiffness_n_per_m: 5.0,
         spring_stiffness_n_per_m: 120.0,
+        viscous_time_s: 0.0,
     };
     let of = |precision, damping, substep_s| rounding(precision, &sheet(damping), substep_s);
     let compensated = of(Precision::Compensated, 0.5, 1e-3);

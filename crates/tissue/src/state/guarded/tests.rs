@@ -13,7 +13,8 @@ use palpate_haptics::Tip;
 
 /// The names of all schemes.
 fn schemes() -> impl Iterator<Item = &'static str> {
-    Integrator::NAMES.iter().map(|entry| entry.0).filter(|name| *name != "auto")
+    let of_sheets = |entry: &&(&str, Integrator)| entry.1 != Integrator::Auto && entry.1.takes_anchor_springs();
+    Integrator::NAMES.iter().filter(of_sheets).map(|entry| entry.0)
 }
 
 fn sheet(integrator: &str) -> TissueState<f64> {

@@ -8,7 +8,7 @@ use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::scene::Precision;
 use crate::scheme::stability;
-use crate::scheme::{Oscillator, Relaxation};
+use crate::scheme::{Coefficients, Oscillator, Relaxation};
 use crate::state::guard::survey::{Forces, Survey, Write, energy_of};
 use crate::state::sleep::tiles::SleepTiles;
 use crate::state::step_context::StepContext;
@@ -112,7 +112,7 @@ pub(crate) fn put_to_sleep<T: Real>(
     }
     // In the scheme's units of force and velocity: the anchor springs, drag, and the stiffness that pulls a point back.
     let sheet = Oscillator::of(&model.scene);
-    let (anchor_stiffness, drag) = sheet.scaled(plan.substep_s);
+    let Coefficients { anchor: anchor_stiffness, damping: drag, .. } = sheet.scaled(plan.substep_s);
     let restoring = Relaxation::of(&model.scene).scaled(plan.substep_s);
     // A displacement is known to half its last digit. The spring force that this rounding causes moves
     // nothing: it differs from point to point, and a point between its neighbours yields by as little. Nor
