@@ -38,6 +38,9 @@ const WITHOUT_PAGE: &str = "So there is no page to look at; gRPC is served all t
 /// The same random cases every time, so that the result is that of the change.
 const SEED: (&str, &str) = ("PROPTEST_RNG_SEED", "20261122");
 
+/// What Cargo is asked to test.
+const RUST_TESTS: [&str; 4] = ["test", "--release", "--workspace", "--no-fail-fast"];
+
 /// Tests of a program that run at once on each core: those of a running server wait for half of their time.
 const TESTS_PER_CORE: usize = 3;
 
@@ -165,7 +168,12 @@ impl System {
         }
         if is_asked(TestPart::Viewer) {
             let tests = ["clients/viewer", "clients/typescript"].map(|of| self.npm(of, &["test"]));
-            stages.extend(tests.map(PlanStage::Step));
+            if is_asked(TestPart::Rust) && !self.is_windows {
+                // They use a quarter of the machine: the tests in Rust compile in what is left.
+                stages.extend(beside([vec![self.compiled_tests()], tests.to_vec()].concat()));
+            } else {
+                stages.extend(tests.map(PlanStage::Step));
+            }
         }
         // These wait for most of their time, so that they run at once.
         let mut waiting = Vec::new();
@@ -206,8 +214,15 @@ impl System {
         Ok(stages)
     }
 
+    /// Returns the step that compiles what [`System::rust_tests`] runs, behind all other work.
+    fn compiled_tests(&self) -> Step {
+        let cargo = self.cargo(&RUST_TESTS);
+        let arguments = ["-n", "19", &cargo.program].map(str::to_owned).into_iter().chain(cargo.arguments);
+        Step { arguments: arguments.chain(["--no-run".to_owned()]).collect(), ..step("nice", &[]) }
+    }
+
     fn rust_tests(&self) -> PlanStage {
-        let test = self.cargo(&["test", "--release", "--workspace", "--no-fail-fast"]);
+        let test = self.cargo(&RUST_TESTS);
         let threads = ("RUST_TEST_THREADS", (TESTS_PER_CORE * self.cores).to_string());
         PlanStage::Step(Step { variables: vec![(SEED.0, SEED.1.to_owned()), threads], ..test })
     }
@@ -352,8 +367,9 @@ mod tests {
             unix,
             [
                 WORKSPACE,
-                "(in clients/viewer) npm test",
-                "(in clients/typescript) npm test",
+                "nice -n 19 cargo test --release --workspace --no-fail-fast --no-run",
+                "(in clients/viewer) npm test   # at the same time",
+                "(in clients/typescript) npm test   # at the same time",
                 "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
                  --force-reinstall --config-settings=build-args=--features=workspace-features ./clients/python",
                 "target/venv/bin/python -m unittest discover -s clients/python/tests -v",
@@ -365,9 +381,10 @@ mod tests {
             ]
         );
         let windows = lines(&ProjectTask::Test(vec![]), &built(true));
-        assert_eq!(windows.len(), unix.len());
-        for (windows, unix) in windows.iter().zip(&unix) {
+        assert_eq!(windows.len(), unix.len() - 1);
+        for (windows, unix) in windows.iter().zip(unix.iter().filter(|line| !line.starts_with("nice "))) {
             let same = unix.replace("venv/bin/python", "venv/Scripts/python.exe").replace(") npm ", ") npm.cmd ");
+            let same = if same.contains("npm.cmd test") { same.replace("   # at the same time", "") } else { same };
             assert!(
                 *windows == same || windows.starts_with("# left out") && unix.starts_with("sh "),
                 "{windows}: {unix}"
