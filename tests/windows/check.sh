@@ -45,7 +45,7 @@ has_hash GOLDEN_F32 --set stepping.precision=f32
 has_hash GOLDEN_F64 --set stepping.precision=f64 --set springs.bending=true --set stepping.substeps=3
 say 'the golden hashes are those of Linux'
 
-for run in 'paper press' 'paper vertical-60 --held' 'liver press' 'liver stroke' 'stomach push' 'fibrotic grasp' 'liver-organ press'; do
+for run in 'paper press' 'paper vertical-60 --held' 'liver press' 'liver stroke' 'stomach push' 'fibrotic grasp' 'liver-organ press' 'liver-solid press'; do
     # shellcheck disable=SC2086
     set -- $run
     windows "$exe/palpate.exe" run "$@" --output "$work/windows.jsonl" --quiet 2>/dev/null
@@ -54,7 +54,7 @@ for run in 'paper press' 'paper vertical-60 --held' 'liver press' 'liver stroke'
     for of in windows linux; do sed 's/"wall_s":[^,]*,"ns_per_point_substep":[^,]*,//' "$work/$of.jsonl" > "$work/$of"; done
     cmp "$work/windows" "$work/linux"
 done
-say 'seven runs of scripts: the same records as on Linux'
+say 'eight runs of scripts: the same records as on Linux'
 
 serve() { # command of a server
     rm -f "$work/serving"
