@@ -20,6 +20,9 @@ namespace Palpate
     /// <summary>Axes and unit of positions, normals and forces; see palpate_axes.</summary>
     public enum Axes : uint { Own = 0, Unity = 1, Unreal = 2 }
 
+    /// <summary>How a tip presses: with an even pressure, or rigid, which solids alone take; see palpate_tip_shape.</summary>
+    public enum TipShape : uint { Disc = 0, RigidDisc = 1, Sphere = 2 }
+
     /// <summary>Whether forces are rendered; see palpate_state.</summary>
     public enum State : uint { Waiting = 0, Disabled = 1, Enabled = 2, Paused = 3, Fault = 4 }
 
@@ -130,6 +133,8 @@ namespace Palpate
         /// <summary>Which tissues to keep a local copy of: 0 none, 1 meshes, 2 any; see
         /// palpate_touch_options.</summary>
         public uint Prediction;
+        /// <summary>How the tip presses.</summary>
+        public TipShape TipShape;
         public bool InTissueFrame { get { return inTissueFrame != 0; } set { inTissueFrame = value ? 1u : 0u; } }
         public bool Grasps { get { return grasps != 0; } set { grasps = value ? 1u : 0u; } }
         public bool Datagrams { get { return datagrams != 0; } set { datagrams = value ? 1u : 0u; } }

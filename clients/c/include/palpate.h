@@ -130,6 +130,24 @@ typedef enum palpate_priority {
 } palpate_priority;
 
 /**
+ * How a tip presses.
+ */
+typedef enum palpate_tip_shape {
+  /**
+   * A flat disc of even pressure.
+   */
+  PALPATE_TIP_DISC = 0,
+  /**
+   * A flat rigid disc.
+   */
+  PALPATE_TIP_RIGID_DISC = 1,
+  /**
+   * A rigid sphere, whose middle is at the position.
+   */
+  PALPATE_TIP_SPHERE = 2,
+} palpate_tip_shape;
+
+/**
  * A device's loop that runs on a thread of the library, from `palpate_bridge_begin` until `palpate_bridge_end`,
  * or until the device fails. When the connection breaks, the library connects again.
  */
@@ -322,6 +340,10 @@ typedef struct palpate_touch_options {
    * all. A thread of the library steps the copy; a tick uses its result for the last tick, and waits for nothing.
    */
   uint32_t prediction;
+  /**
+   * How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Others touch solids alone, and do not hold.
+   */
+  uint32_t tip_shape;
 } palpate_touch_options;
 
 /**

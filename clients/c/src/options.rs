@@ -4,7 +4,7 @@ use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
 use palpate_client::bridge::{Copies, PositionOrigin, Warn};
-use palpate_haptics::{Device, Tip};
+use palpate_haptics::{Device, Tip, TipShape};
 use palpate_proto::{pb, touch};
 use palpate_session::journal;
 
@@ -95,6 +95,8 @@ pub struct palpate_touch_options {
     /// correct the copy. 0 (default): none; 1: meshes, whose rims, folds and lumps no local model can predict; 2:
     /// all. A thread of the library steps the copy; a tick uses its result for the last tick, and waits for nothing.
     pub prediction: u32,
+    /// How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Others touch solids alone, and do not hold.
+    pub tip_shape: u32,
 }
 
 /// Options of `palpate_surface_open`.
@@ -229,6 +231,7 @@ unsafe impl Versioned for palpate_touch_options {
             warn: None,
             warn_user: std::ptr::null_mut(),
             prediction: 0,
+            tip_shape: palpate_tip_shape::default() as u32,
         }
     }
 }
@@ -280,6 +283,32 @@ pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, Co
     // SAFETY: this number of bytes is valid on both sides.
     unsafe { std::ptr::copy_nonoverlapping(pointer.cast::<u8>(), (&raw mut options).cast::<u8>(), size) };
     Ok(options)
+}
+
+/// How a tip presses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum palpate_tip_shape {
+    /// A flat disc of even pressure.
+    #[default]
+    PALPATE_TIP_DISC = 0,
+    /// A flat rigid disc.
+    PALPATE_TIP_RIGID_DISC = 1,
+    /// A rigid sphere, whose middle is at the position.
+    PALPATE_TIP_SPHERE = 2,
+}
+
+pub use palpate_tip_shape::*;
+
+impl palpate_tip_shape {
+    fn of(number: u32) -> Result<TipShape, CodedError> {
+        match number {
+            0 => Ok(TipShape::Disc),
+            1 => Ok(TipShape::RigidDisc),
+            2 => Ok(TipShape::Sphere),
+            _ => Err(CodedError::argument(format!("tip_shape is {number}: must be one of palpate_tip_shape"))),
+        }
+    }
 }
 
 /// Checked options for touching.
@@ -345,6 +374,7 @@ impl palpate_touch_options {
             radius_m: within("tip_radius_m", self.tip_radius_m, 1e-4..=0.1)?,
             friction: within("friction", self.friction, 0.0..=10.0)?,
             grasps: self.grasps != 0,
+            shape: palpate_tip_shape::of(self.tip_shape)?,
             ..Tip::default()
         };
         Ok(TouchOptions {

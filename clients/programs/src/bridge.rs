@@ -6,7 +6,7 @@ use glam::DVec3;
 use palpate_client::HapticDevice;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run};
 use palpate_client::devices::{self, DeviceKind, Placed};
-use palpate_haptics::{LimitCause, RenderingState, Tip};
+use palpate_haptics::{LimitCause, RenderingState, Tip, TipShape};
 use palpate_refusal::printable::printable_json;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
@@ -43,6 +43,12 @@ pub(crate) struct BridgeArguments {
     library: Option<std::path::PathBuf>,
     #[command(flatten)]
     placement: PlacementOptions,
+    /// The tool's tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid
+    #[arg(long, value_name = "SHAPE", default_value = "disc")]
+    tip: TipShape,
+    /// Radius of the tool's tip, m
+    #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
+    radius_m: f64,
     /// The simulated hand that holds a simulated device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
@@ -112,7 +118,7 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
             None => SessionChoice::New { scene: arguments.scene.clone() },
         },
         tool: arguments.tool,
-        tip: Tip::default(),
+        tip: Tip { shape: arguments.tip, radius_m: arguments.radius_m, ..Tip::default() },
         deadband: arguments.deadband,
         up_deadband: arguments.up_deadband,
         datagrams: !arguments.no_datagrams,

@@ -1,7 +1,7 @@
 // The poses of a tool in a datagram: the newest, and the differences to those before it, which may have been lost.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
-import type { EarlierPoseSchema, PoseSchema, ToolPosesSchema } from "./gen/palpate/v1/haptic_pb.js";
+import type { EarlierPoseSchema, PoseSchema, TipShape, ToolPosesSchema } from "./gen/palpate/v1/haptic_pb.js";
 import type { Vec3 } from "./vector.js";
 
 /** Maximum number of poses before the newest. */
@@ -13,6 +13,8 @@ const FAR_NM = 1e10;
 export interface Lead {
   positionM: Vec3;
   radiusM: number;
+  /** A disc of even pressure if absent. Other tips touch solids alone. */
+  shape?: TipShape;
 }
 
 /** A pose that was sent. */
@@ -23,8 +25,8 @@ interface Posed {
 }
 
 /** Converts a pose to a message. */
-export function poseOf({ positionM: [x, y, z], radiusM }: Lead): MessageInitShape<typeof PoseSchema> {
-  return { positionM: { x, y, z }, tip: { radiusM } };
+export function poseOf({ positionM: [x, y, z], radiusM, shape }: Lead): MessageInitShape<typeof PoseSchema> {
+  return { positionM: { x, y, z }, tip: { radiusM, shape } };
 }
 
 /** The newest poses of a tool with a single tip. */

@@ -6,6 +6,7 @@
 // tissue from there.
 
 import { type Action, type Lead, Tool, type Vec3, type Wanted } from "palpate";
+import { type TipShape } from "palpate/v1";
 import { server } from "./server";
 import type { Place, Surface } from "./surface";
 
@@ -26,6 +27,8 @@ export interface Reach {
   pointN: number;
   /** Length of a drag that tilts a push fully, and of a pull by keys, m. */
   depthM: number;
+  /** Shape of the tip: a solid yields to a rigid one at any depth, and is unstable under an even pressure that is deep. */
+  tipShape: TipShape;
 }
 
 export class Hand {
@@ -133,7 +136,7 @@ export class Hand {
     const radiusM = this.reach.lengthM;
     const part = Math.min(1, (now - this.pressedMs) / SINK_MS);
     const outM = (1 - part) * 1.1 * radiusM - part * this.strength * this.reach.depthM;
-    return { positionM: [restM[0] + outM * n[0], restM[1] + outM * n[1], restM[2] + outM * n[2]], radiusM };
+    return { positionM: [restM[0] + outM * n[0], restM[1] + outM * n[1], restM[2] + outM * n[2]], radiusM, shape: this.reach.tipShape };
   }
 
   private action(place: Place): Action {

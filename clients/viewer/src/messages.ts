@@ -1,6 +1,6 @@
 // Messages about a session and its tools for the user.
 
-import { type Session, SessionState } from "palpate/v1";
+import { type Session, SessionState, TipShape } from "palpate/v1";
 import { depthText } from "./overlay";
 import { quantity } from "./plot";
 import type { Told } from "./samples";
@@ -53,7 +53,8 @@ export function strengthText({ hand: { mode, strength }, reach }: ShownSession):
 export function meaningText({ hand, reach, surface }: ShownSession): string {
   const range = quantity(reach.lengthM, "m");
   if (hand.mode === "tip") {
-    return `The tip is a disc of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
+    const disc = reach.tipShape === TipShape.RIGID_DISC ? "a rigid disc" : "a disc";
+    return `The tip is ${disc} of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
   }
   return surface.edge
     ? "Strength is the push in the middle of the tool. It fades out over about " +

@@ -4,7 +4,7 @@ import { Body } from "./body";
 import { fingerM } from "./coefficients";
 import { isBarred } from "./token-form";
 import { fetchMesh, Frames, type MeshData, norm } from "palpate";
-import type { Session } from "palpate/v1";
+import { type Session, TipShape } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
@@ -93,6 +93,7 @@ export class ShownSession {
     this.rateHz = session.scene?.stepping?.rateHz ?? 1000;
     const k = session.scene?.springs?.stiffnessNPerM ?? 0;
     const anchor = session.scene?.anchorSprings?.stiffnessNPerM ?? 0;
+    const tipShape = session.scene?.solid ? TipShape.RIGID_DISC : TipShape.DISC;
     if (mesh) {
       const sizeM = boxOf(mesh);
       const lengthM = fingerM(sizeM, mesh.edgeM);
@@ -102,13 +103,13 @@ export class ShownSession {
       const { sum } = this.surface.push(this.surface.middle(), lengthM);
       // If the springs of a tissue differ, no such force can be given.
       const mostN = rounded(sum * aPointN || 2);
-      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM };
+      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape };
       this.widthM = sizeM;
     } else {
       // A push falls off over a spacing, so that a few points share it: its depth is about two spacings.
       const lengthM = grid?.spacingM ?? 1;
       const mostN = 2 * lengthM * (2 * k + anchor) || lengthM;
-      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM };
+      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape };
       this.widthM = (this.points[0] - 1) * lengthM;
     }
     // A mesh is shown with its own vertices.

@@ -203,6 +203,14 @@ describe("a body of any shape", () => {
     await felt(page);
     await page.picture("bad-solid");
     await page.page.mouse.up();
+    await page.until(({ forceN }) => forceN.length === 0);
+    // A solid is touched with a rigid tip.
+    await page.page.check("input[value=tip]", { force: true });
+    await page.says("meaning", /a rigid disc of/);
+    await page.press();
+    await felt(page);
+    await page.says("touch", /deep\s*.*N back/);
+    await page.page.mouse.up();
     assert.deepEqual(page.complaints, []);
     await close(page);
   });
