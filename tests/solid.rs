@@ -124,6 +124,65 @@ fn every_scheme_steps_a_solid_and_its_bits_are_those_of_every_width() {
     }
 }
 
+/// Under its weight a column that is held below sinks by ρ·g·H²/2M, with M = λ + 2μ if its sides do not move. This block is wide, and in its
+/// middle nearly so.
+#[test]
+fn a_block_sags_under_its_weight_and_not_if_its_file_has_the_shape_under_gravity() {
+    let sag_m = |gravity: &str, more: &[&str]| {
+        let text = block_text("cell_m = 0.005").replace("[stepping]", &format!("{gravity}\n[stepping]"));
+        let mut tissue = at_rest(&Model::compile(&read(&text, more).unwrap(), &Limits::default()).unwrap());
+        (0..1000).for_each(|_| tissue.step().unwrap());
+        assert_eq!(tissue.guard_events(), 0);
+        (tissue.surface_displacement_m(DVec3::new(0.03, 0.03, 0.03)).z, tissue.awake_points())
+    };
+    let acceleration = "acceleration_m_per_s2 = [0, 0, -9.81]";
+    // In compliant air, ν = 0: M = E, without any effect of the sides.
+    let (free_m, awake) = sag_m(&format!("[gravity]\n{acceleration}"), &["material.poissons_ratio=0"]);
+    let theory_m = -1060.0 * 9.81 * 0.03 * 0.03 / (2.0 * 8e3);
+    println!("{free_m} {theory_m} {awake}");
+    assert!((free_m / theory_m - 1.0).abs() < 0.04, "{free_m} {theory_m}");
+    // It sleeps when it has sunk.
+    assert_eq!(awake, 0);
+    assert_eq!(sag_m(&format!("[gravity]\n{acceleration}\nloaded = true"), &[]).0, 0.0);
+    assert_eq!(sag_m("", &[]).0, 0.0);
+}
+
+/// A block that lies on a foundation on all sides moves as a whole: by F/(k·A) under a force F that is spread over it, here its weight.
+#[test]
+fn a_solid_that_only_its_foundation_holds_gives_way_as_a_whole() {
+    const FOUNDATION_N_PER_M3: f64 = 2e4;
+    let text = block_text("cell_m = 0.005\nfoundation_n_per_m3 = 2e4");
+    let held = "fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1] }]";
+    let gravity = "[gravity]\nacceleration_m_per_s2 = [0, 0, -9.81]\n[stepping]";
+    let text = text.replace(held, "fixed = \"none\"").replace("[stepping]", gravity);
+    let scene = read(&text, &["material.youngs_modulus_pa=8e4", "stepping.substeps=16"]).unwrap();
+    let mut tissue = at_rest(&Model::compile(&scene, &Limits::default()).unwrap());
+    (0..3000).for_each(|_| tissue.step().unwrap());
+    assert_eq!(tissue.guard_events(), 0);
+    let area_m2 = 2.0 * (0.06 * 0.06 + 0.06 * 0.03 + 0.06 * 0.03);
+    let theory_m = -1060.0 * 9.81 * 0.06 * 0.06 * 0.03 / (FOUNDATION_N_PER_M3 * area_m2);
+    let moved_m = [[0.03, 0.03, 0.03], [0.03, 0.03, 0.0], [0.0, 0.03, 0.015]]
+        .map(|place| tissue.surface_displacement_m(DVec3::from_array(place)).z);
+    println!("{moved_m:?} {theory_m}");
+    assert!((moved_m.iter().sum::<f64>() / 3.0 / theory_m - 1.0).abs() < 0.05, "{moved_m:?} {theory_m}");
+    // The same bits at every width, in the midst of the fall.
+    let hash = |lanes: &str| {
+        let scene = read(&text, &[&format!("stepping.lanes={lanes}"), "stepping.substeps=4"]).unwrap();
+        let mut tissue = at_rest(&Model::compile(&scene, &Limits::default()).unwrap());
+        (0..40).for_each(|_| tissue.step().unwrap());
+        assert!(tissue.largest_displacement_m() > 1e-4);
+        tissue.state_hash()
+    };
+    assert_eq!(hash("plain"), hash("auto"));
+    // Without a foundation nothing would hold the block.
+    let refusal = read(&text.replace("foundation_n_per_m3 = 2e4", ""), &[]).unwrap_err();
+    assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::Missing, "solid.foundation_n_per_m3"));
+    // Gravity is of a solid.
+    let sheet = format!("{}\n[gravity]\nacceleration_m_per_s2 = [0, 0, 1]\n", scene::PAPER);
+    let refusal = Scene::parse("paper", &sheet, &[], &Limits::default()).unwrap_err();
+    assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::WrongKind, "gravity"));
+}
+
 /// All schemes step the same viscous solid: the finer, the nearer they are to each other.
 #[test]
 fn a_viscous_solid_moves_the_same_with_every_scheme() {

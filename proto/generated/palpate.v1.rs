@@ -2394,6 +2394,9 @@ pub struct Scene {
     /// Resistance of a closed mesh to a change of its volume; absent: none.
     #[prost(message, optional, tag = "11")]
     pub volume: ::core::option::Option<Volume>,
+    /// Gravity on a solid; absent: none.
+    #[prost(message, optional, tag = "13")]
+    pub gravity: ::core::option::Option<Gravity>,
     /// Rate, integrator and precision.
     #[prost(message, optional, tag = "6")]
     pub stepping: ::core::option::Option<Stepping>,
@@ -2409,6 +2412,27 @@ impl ::prost::Name for Scene {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Scene".into()
+    }
+}
+/// Gravity on a solid.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Gravity {
+    /// The acceleration, m/s²; at most 1000 long. Required.
+    #[prost(message, optional, tag = "1")]
+    pub acceleration_m_per_s2: ::core::option::Option<Vector3>,
+    /// Whether the mesh has its shape under gravity: stresses that are not modelled balance the weight. Otherwise it is the shape
+    /// without weight, and the tissue sags from its first step on.
+    #[prost(bool, tag = "2")]
+    pub loaded: bool,
+}
+impl ::prost::Name for Gravity {
+    const NAME: &'static str = "Gravity";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Gravity".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Gravity".into()
     }
 }
 /// The grid of mass points.
@@ -2513,7 +2537,7 @@ pub struct Solid {
     /// Number of cubes, approximately; at least 1. 20,000 if `cell_m` is absent too.
     #[prost(uint32, optional, tag = "3")]
     pub cells: ::core::option::Option<u32>,
-    /// Parts whose points never move; at least one.
+    /// Parts whose points never move. At least one, or a foundation.
     #[prost(message, repeated, tag = "4")]
     pub fixed: ::prost::alloc::vec::Vec<FixedPart>,
     /// E, Young's modulus, Pa; above 0. Required.
@@ -2537,6 +2561,10 @@ pub struct Solid {
     /// most 36 µs.
     #[prost(double, optional, tag = "10")]
     pub viscosity_pa_s: ::core::option::Option<f64>,
+    /// Stiffness of a foundation under all of the surface: each part of it is pulled back to where it rests, by this for each area and
+    /// displacement (Winkler), N/m³; 0 or more. 0 if absent.
+    #[prost(double, optional, tag = "11")]
+    pub foundation_n_per_m3: ::core::option::Option<f64>,
 }
 impl ::prost::Name for Solid {
     const NAME: &'static str = "Solid";

@@ -12,8 +12,8 @@ use super::required;
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
 use palpate_tissue::scene::sent::{self, MeshFile};
 use palpate_tissue::scene::{
-    Appearance, Body, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Layer,
-    Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid, SolidMaterial, Springs,
+    Appearance, Body, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Gravity, Inclusion, Integrator, Lanes,
+    Layer, Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid, SolidMaterial, Springs,
     Stepping, Substance, Volume,
 };
 use palpate_tissue::shape::RestShape;
@@ -32,6 +32,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         Some(_) => Err(Refusal::new(Reason::WrongKind, field, "does not go with `sheet`: a tissue is one of them")),
         None => Ok(()),
     };
+    refuse_given([("gravity", message.gravity.is_some() && message.solid.is_none(), Gravity::OF_A_SOLID)])?;
     let substance = match (&message.mesh, &message.solid) {
         (None, None) => from_sheet(message)?,
         (Some(of_mesh), None) => {
@@ -182,13 +183,18 @@ fn from_solid(message: &pb::Scene, of_solid: &pb::Solid, mesh: &TriangleMesh) ->
         (None, None) => CellSize::USUAL,
     };
     let fixed = of_solid.fixed.iter().enumerate().map(from_fixed_part).collect::<Result<Vec<_>>>()?;
-    if fixed.is_empty() {
-        return Err(Refusal::new(Reason::Missing, "solid.fixed", "is missing: nothing would hold the solid"));
-    }
     let layers = of_solid.layers.iter().enumerate().map(from_layer).collect::<Result<Vec<_>>>()?;
     let solid = Solid::of(mesh.clone(), size, &fixed, material)?.with_layers(&layers, "solid.layers")?;
+    let solid = solid.with_foundation(of_solid.foundation_n_per_m3.unwrap_or(0.0))?;
+    let gravity = message.gravity.as_ref().map_or(Ok(Gravity::default()), from_gravity)?;
+    let solid = solid.with_gravity(gravity);
     let inclusions = message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?;
     Substance::of_solid(solid).with(inclusions, "inclusions")
+}
+
+fn from_gravity(message: &pb::Gravity) -> Result<Gravity> {
+    let acceleration = required("gravity.acceleration_m_per_s2", message.acceleration_m_per_s2.as_ref())?;
+    Ok(Gravity { acceleration_m_per_s2: from_vector(Some(acceleration)), is_loaded: message.loaded })
 }
 
 fn from_layer((index, message): (usize, &pb::Layer)) -> Result<Layer> {
@@ -411,6 +417,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         }),
         anchor_springs: Some(pb::AnchorSprings { stiffness_n_per_m: Some(scene.anchor_stiffness_n_per_m) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(scene.damping_n_s_per_m) }),
+        gravity: if let Body::Solid(solid) = &scene.body { gravity(solid.gravity()) } else { None },
         volume: scene.volume().map(|_| pb::Volume { stiffness_pa: Some(scene.volume_stiffness_pa) }),
         stepping: Some(pb::Stepping {
             rate_hz: Some(scene.stepping.rate_hz),
@@ -422,6 +429,12 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         }),
         sleep: scene.sleep_tolerance.map(|tolerance| pb::Sleep { tolerance: Some(tolerance) }),
     }
+}
+
+/// Returns gravity as a message; `None` without.
+fn gravity(of: &Gravity) -> Option<pb::Gravity> {
+    let message = pb::Gravity { acceleration_m_per_s2: vector(of.acceleration_m_per_s2), loaded: of.is_loaded };
+    (*of != Gravity::default()).then_some(message)
 }
 
 /// Returns a solid as a message, without its surface.
@@ -451,6 +464,7 @@ fn solid(solid: &Solid) -> pb::Solid {
         density_kg_per_m3: Some(solid.material.density_kg_per_m3),
         damping_per_s: Some(solid.material.damping_per_s),
         viscosity_pa_s: Some(solid.material.viscosity_pa_s),
+        foundation_n_per_m3: Some(solid.foundation_n_per_m3()).filter(|stiffness| *stiffness > 0.0),
         layers: solid.layers().iter().map(layer).collect(),
     }
 }

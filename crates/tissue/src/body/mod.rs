@@ -94,6 +94,11 @@ impl MemoryLayout {
 }
 
 impl Places {
+    /// Returns whether gravity moves a tissue that no tool touches.
+    pub(crate) fn is_pulled(&self) -> bool {
+        matches!(self, Places::Solid(places) if places.pull_m_per_s2 != DVec3::ZERO)
+    }
+
     /// Returns what a mesh has, if the tissue is one.
     fn surface(&self) -> Option<&MeshPlaces> {
         match self {

@@ -283,6 +283,16 @@ impl Model {
         self.relative_mass_at(index) * (1.0 + self.extra_anchor_at(index))
     }
 
+    /// Returns the stiffness that pulls the point at a place in memory back to where it rests, whatever its neighbours do: that of its anchor
+    /// spring, or of a foundation, N/m.
+    pub(crate) fn own_stiffness_n_per_m(&self, index: usize) -> f64 {
+        let by_foundation = match &self.places {
+            Places::Solid(places) => places.foundation_n_per_m * places.bed(index) * places.mass(index),
+            Places::Sheet(_) | Places::Surface(_) => 0.0,
+        };
+        self.scene.anchor_stiffness_n_per_m * self.relative_anchor_stiffness_at(index) + by_foundation
+    }
+
     /// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables in their unit
     /// ([`Plan::spring_unit`]) and the displacement in spacings.
     pub(crate) fn spring_force_n(&self, spring_unit: f64, index: usize, gathered: f64, u: f64) -> f64 {

@@ -10,7 +10,7 @@ use crate::body::force_field::{self, Pull, Term};
 use crate::body::model::{Model, Plan};
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
-use crate::body::solid::{self, NeoHookean, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
+use crate::body::solid::{self, NeoHookean, PointLoad, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
@@ -31,8 +31,8 @@ pub(crate) enum Elastic<T> {
     /// A mesh: its places; a spring of length 1 with the reference k, of which those of the mesh are multiples;
     /// the factor of the extra anchor stiffness; and the factor of the growth of a volume.
     Mesh(Arc<MeshPlaces>, SpringCoefficients<T>, T, f64),
-    /// A solid: its places, and the law of its cubes.
-    Solid(Arc<SolidPlaces>, NeoHookean<T>),
+    /// A solid: its places, the law of its cubes, and what else acts on its points.
+    Solid(Arc<SolidPlaces>, NeoHookean<T>, PointLoad<T>),
 }
 
 impl<T: Real> Elastic<T> {
@@ -47,7 +47,9 @@ impl<T: Real> Elastic<T> {
     pub(crate) fn gather_inline(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
-            Elastic::Solid(places, law) => solid::gather(places, law, layout, u, point[0] * layout.columns + point[1]),
+            Elastic::Solid(places, law, load) => {
+                solid::gather(places, law, load, layout, u, point[0] * layout.columns + point[1])
+            }
             Elastic::Mesh(places, unit, pull, factor) => {
                 let slot = point[0] * BLOCK + point[1];
                 let pressed = places.volume.as_ref().map(|volume| {
@@ -84,7 +86,8 @@ pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
         Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
         Places::Solid(places) => {
             let (stiffness, [shear, lame]) = (unit * model.scene.springs.stiffness_n_per_m, places.lame_over_youngs());
-            Elastic::Solid(places.clone(), NeoHookean::new(stiffness, shear, lame))
+            let load = PointLoad::new(places, unit, unit * model.scene.point_mass_kg() / model.unit_m);
+            Elastic::Solid(places.clone(), NeoHookean::new(stiffness, shear, lame), load)
         }
         Places::Surface(places) => Elastic::Mesh(
             places.clone(),
@@ -272,9 +275,9 @@ impl<T: Real> SweepTables<T> {
                 // SAFETY: the caller's promise.
                 unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
             }
-            (Elastic::Solid(places, law), _) => {
+            (Elastic::Solid(places, law, load), _) => {
                 let Some(tables) = &self.solid else { return };
-                let grid = SolidGrid { layout, places, tables, law, x };
+                let grid = SolidGrid { layout, places, tables, law, load, x };
                 // SAFETY: the caller's promise; the tables were made for these places.
                 unsafe { lanes::run(self.width, &SolidSweep { grid, over, stage }) };
             }

@@ -93,9 +93,10 @@ pub struct LinearPatch<'m> {
     free: Vec<bool>,
     /// E, one weight per point.
     weights: Vec<f64>,
-    /// Mass and K″ of each point divided by the reference values.
+    /// Mass of each point divided by the reference value.
     masses: Vec<f64>,
-    stiffness: Vec<f64>,
+    /// What pulls each point back to where it rests, N/m.
+    own_n_per_m: Vec<f64>,
     elements: Elements,
     pressure: Option<SharedPressure>,
     inverses: Vec<DMat3>,
@@ -187,7 +188,7 @@ impl<'m> LinearPatch<'m> {
         let free = window.free(model);
         let elements = window.elements(model, &free, turn);
         let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();
-        let stiffness = window.points(model).map(|index| model.relative_anchor_stiffness_at(index)).collect();
+        let own_n_per_m = window.points(model).map(|index| model.own_stiffness_n_per_m(index)).collect();
         let mut patch = LinearPatch {
             model,
             pressure: SharedPressure::of(model, &window, &free, turn),
@@ -196,7 +197,7 @@ impl<'m> LinearPatch<'m> {
             free,
             weights,
             masses,
-            stiffness,
+            own_n_per_m,
             elements,
             inverses: Vec::new(),
             accuracy: Accuracy::EXACT,
@@ -215,9 +216,8 @@ impl<'m> LinearPatch<'m> {
 
     /// Computes forces and tangents at the present displacements.
     fn linearise(&mut self) {
-        let own = self.model.scene.anchor_stiffness_n_per_m;
         self.inverses.clear();
-        self.inverses.extend(self.stiffness.iter().map(|part| DMat3::from_diagonal(DVec3::splat(own * part))));
+        self.inverses.extend(self.own_n_per_m.iter().map(|own| DMat3::from_diagonal(DVec3::splat(*own))));
         self.elements.linearise(&self.displacement_m, &mut self.inverses);
         if let Some(SharedPressure { areas_m2, pa_per_m3 }) = &self.pressure {
             for (block, area) in self.inverses.iter_mut().zip(areas_m2) {
@@ -232,10 +232,9 @@ impl<'m> LinearPatch<'m> {
 
     /// Writes K·x for `N` vectors at once to `product`.
     fn times<const N: usize>(&self, x: &[[DVec3; N]], product: &mut [[DVec3; N]]) {
-        let own = self.model.scene.anchor_stiffness_n_per_m;
-        for ((product, x), part) in product.iter_mut().zip(x).zip(&self.stiffness) {
+        for ((product, x), own) in product.iter_mut().zip(x).zip(&self.own_n_per_m) {
             for system in 0..N {
-                product[system] = own * part * x[system];
+                product[system] = *own * x[system];
             }
         }
         self.elements.times(x, product);
@@ -332,15 +331,14 @@ impl<'m> LinearPatch<'m> {
 
     /// Moves the disc's z to `-depth_m` quasi-statically (Newton's method). Returns the force on the disc, N.
     fn press(&mut self, depth_m: f64) -> f64 {
-        let own = self.model.scene.anchor_stiffness_n_per_m;
         let mut force_n = 0.0;
         for _ in 0..MAX_NEWTON {
             let mut right: Vec<[DVec3; 2]> = self
                 .displacement_m
                 .iter()
                 .zip(&self.weights)
-                .zip(&self.stiffness)
-                .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z])
+                .zip(&self.own_n_per_m)
+                .map(|((u, weight), own)| [-*own * *u, *weight * DVec3::Z])
                 .collect();
             self.elements.forces(|point, force_n| right[point][0] += force_n);
             if let Some(pressure) = &self.pressure {

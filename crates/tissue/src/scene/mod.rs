@@ -42,7 +42,7 @@ pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{Shown, Simulated};
-pub use solid::{CellSize, FixedPart, Layer, Solid, SolidMaterial, SolidShape};
+pub use solid::{CellSize, FixedPart, Gravity, Layer, Solid, SolidMaterial, SolidShape};
 use source::Files;
 pub use springs::Springs;
 use toml_document::{Document, Fields, Item};
@@ -774,7 +774,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     let mut given = Body::SECTIONS.iter().filter_map(|section| Some((*section, fields.item(section)?)));
     let (first, second) = (given.next(), given.next());
     let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
-    let layers = fields.item("layer");
+    let (layers, gravity) = (fields.item("layer"), fields.item("gravity"));
     let of_material = material.is_some();
     if let (Some((section, _)), Some((_, other))) = (&first, &second) {
         let message = format!("does not go with [{section}]: a tissue is one of them");
@@ -792,15 +792,20 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
         return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
     }
     if section != Solid::SECTION
-        && let Some(item) = &layers
+        && let Some((item, message)) = (layers.as_ref().map(|item| (item, Layer::OF_A_SOLID)))
+            .or(gravity.as_ref().map(|item| (item, Gravity::OF_A_SOLID)))
     {
-        return Err(item.refuse(Reason::WrongKind, Layer::OF_A_SOLID));
+        return Err(item.refuse(Reason::WrongKind, message));
     }
     let body = fields.required(section)?.table(|fields| Body::read(section, fields, files, of_material, limits))?;
     let substance = match (body, material) {
-        (Body::Solid(solid), material) => {
-            Substance::of_solid(solid::read_material(fields, &solid, material.as_ref(), layers.as_ref())?)
-        }
+        (Body::Solid(solid), material) => Substance::of_solid(solid::read_material(
+            fields,
+            &solid,
+            material.as_ref(),
+            layers.as_ref(),
+            gravity.as_ref(),
+        )?),
         (Body::Mesh(mesh), material) => {
             if mesh.shape.point_count() > limits.points {
                 mesh.check(limits)?;

@@ -374,7 +374,7 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Rewrites the whole state.
-    fn write(&mut self, write: Write) {
+    pub(super) fn write(&mut self, write: Write) {
         let terms = self.present_terms();
         self.tables.press(&self.state.u, self.tiles.region.tiles());
         let TissueState { plan, tables, state, tiles, .. } = self;

@@ -25,7 +25,7 @@ use crate::scheme::observer::Observer;
 use crate::shape::PointId;
 use crate::stage_times::{StageTimes, StepStage};
 use crate::state::guard::checkpoint::{Checkpoint, Repetition};
-use crate::state::guard::survey::{Forces, Survey, energy_of, pressure_j};
+use crate::state::guard::survey::{Forces, Survey, Write, energy_of, pressure_j};
 use crate::state::guard::work_account::WorkAccount;
 use crate::state::point_reader::PointReader;
 use crate::state::sleep::criterion::add_sleeping;
@@ -83,7 +83,7 @@ impl<T: Real> TissueState<T> {
     pub(crate) fn new(model: &Arc<Model>) -> Self {
         let layout = Layout::new::<T>(model.points);
         let plan = model.plan.clone();
-        TissueState {
+        let mut tissue = TissueState {
             model: model.clone(),
             halvings: 0,
             tables: SweepTables::new(model, layout, springs_of(model, &plan)),
@@ -105,7 +105,12 @@ impl<T: Real> TissueState<T> {
             known_volume_change: Cell::new(None),
             stage_times: None,
             plan,
+        };
+        if model.places.is_pulled() {
+            tissue.tiles.wake_all();
+            tissue.write(Write::Begin);
         }
+        tissue
     }
 
     /// Returns by how much the volume of a mesh has grown, in cubes of the unit of length.

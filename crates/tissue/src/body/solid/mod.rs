@@ -18,4 +18,4 @@ mod tests;
 
 pub(crate) use neo_hookean::NeoHookean;
 pub(crate) use places::SolidPlaces;
-pub(crate) use sweep::{SolidGrid, SolidSweep, SolidTables, gather};
+pub(crate) use sweep::{PointLoad, SolidGrid, SolidSweep, SolidTables, gather};

@@ -27,6 +27,13 @@ pub(crate) struct SolidPlaces {
     /// The relative mass of each place; 0 where there is no point.
     masses: Vec<f64>,
     pub(crate) largest_mass: f64,
+    /// The stiffness of the foundation at each place divided by its relative mass and by that of `foundation_n_per_m`; empty without a
+    /// foundation.
+    beds: Vec<f64>,
+    /// The stiffness of the foundation of a face of a cube, N/m.
+    pub(crate) foundation_n_per_m: f64,
+    /// The acceleration that stress must balance, m/s².
+    pub(crate) pull_m_per_s2: DVec3,
     pub(crate) links: TileLinks,
     /// μ/E and λ/E.
     lame_over_youngs: [f64; 2],
@@ -47,12 +54,24 @@ impl SolidPlaces {
             masses[shape.corner_of(point)] = solid.relative_mass(point);
         }
         let largest_mass = masses.iter().copied().fold(0.0, f64::max);
+        let foundation_n_per_m = solid.foundation_n_per_m3() * shape.lattice().edge_m.powi(2);
+        let mut beds = Vec::new();
+        if foundation_n_per_m > 0.0 {
+            beds = memory::zeroed(count, TABLES);
+            for point in crate::shape::points(&*shape) {
+                let place = shape.corner_of(point);
+                beds[place] = solid.foundation_n_per_m(point) / foundation_n_per_m / masses[place];
+            }
+        }
         let mut places = SolidPlaces {
             shape,
             corners,
             weights,
             masses,
             largest_mass,
+            beds,
+            foundation_n_per_m,
+            pull_m_per_s2: solid.gravity().pull_m_per_s2(),
             links: TileLinks::default(),
             lame_over_youngs: [solid.material.shear_over_youngs(), solid.material.lame_over_youngs()],
         };
@@ -88,6 +107,11 @@ impl SolidPlaces {
 
     pub(crate) fn mass(&self, place: usize) -> f64 {
         self.masses[place]
+    }
+
+    /// Returns the stiffness of the foundation at a place divided by its relative mass, in that of a face of a cube.
+    pub(crate) fn bed(&self, place: usize) -> f64 {
+        self.beds.get(place).copied().unwrap_or(0.0)
     }
 
     pub(crate) fn weight(&self, place: usize) -> f64 {

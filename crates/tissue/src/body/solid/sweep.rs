@@ -17,6 +17,8 @@
 use std::cell::RefCell;
 use std::ops::Range;
 
+use glam::DVec3;
+
 use super::neo_hookean::{NeoHookean, Patterns};
 use super::places::SolidPlaces;
 use crate::kernel::field::{BLOCK, Field, Layout};
@@ -32,6 +34,39 @@ const GROUP: usize = 8;
 const CUBES: u8 = 2;
 const CORNERS_ALONE: u8 = 1;
 
+/// What acts on the points of a solid besides its cubes: its weight, and a foundation.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PointLoad<T> {
+    /// The acceleration by gravity, in the scheme's unit of force divided by mass.
+    weight: [T; 3],
+    /// The factor of [`SolidPlaces::bed`] to the scheme's stiffness divided by mass.
+    foundation: T,
+    /// Whether any of them is not 0.
+    acts: bool,
+}
+
+impl<T: Real> PointLoad<T> {
+    /// Creates it with the factors from a stiffness, N/m, and from an acceleration, m/s², to the scheme's units.
+    pub(crate) fn new(places: &SolidPlaces, of_stiffness: f64, of_acceleration: f64) -> Self {
+        let (weight, foundation) = (of_acceleration * places.pull_m_per_s2, of_stiffness * places.foundation_n_per_m);
+        let acts = weight != DVec3::ZERO || foundation != 0.0;
+        PointLoad { weight: weight.to_array().map(T::of), foundation: T::of(foundation), acts }
+    }
+
+    /// Returns the force along an axis at `x`, for a place with this bed.
+    #[inline(always)]
+    fn force<V: Vector<Real = T>>(&self, c: usize, bed: V, x: V) -> V {
+        x.splat(self.weight[c]).minus(x.splat(self.foundation).mul(bed), x)
+    }
+
+    /// Returns the energy of that force, which is 0 at rest.
+    #[inline(always)]
+    fn energy<V: Vector<Real = T>>(&self, c: usize, bed: V, x: V) -> V {
+        let half = x.splat(T::of(0.5)).mul(x.splat(self.foundation).mul(bed));
+        x.mul(half.mul(x).sub(x.splat(self.weight[c])))
+    }
+}
+
 /// The tables of a sweep over a lattice.
 #[derive(Debug)]
 pub(crate) struct SolidTables<T> {
@@ -41,6 +76,8 @@ pub(crate) struct SolidTables<T> {
     mobility: Field<T>,
     /// For each place, its relative mass; 0 where there is no point.
     pub(crate) masses: Field<T>,
+    /// For each place, [`SolidPlaces::bed`].
+    beds: Field<T>,
     /// For each group of columns of each row, what is there.
     groups: Vec<u8>,
     /// The columns of each row that have corners or act on some, in whole blocks.
@@ -55,6 +92,7 @@ impl<T: Real> SolidTables<T> {
             weights: Field::of_length(layout.plane),
             mobility: Field::of_length(layout.plane),
             masses: Field::of_length(layout.plane),
+            beds: Field::of_length(layout.plane),
             groups: vec![0; layout.plane.div_ceil(GROUP)],
             spans: vec![0..0; layout.rows],
             waiting: RefCell::new(Field::of_length(6 * (places.rows_per_plane() + 2) * layout.stride + BLOCK)),
@@ -65,6 +103,7 @@ impl<T: Real> SolidTables<T> {
             let (mass, weight) = (places.mass(place), places.weight(place));
             if mass > 0.0 {
                 tables.masses[at] = T::of(mass);
+                tables.beds[at] = T::of(places.bed(place));
                 tables.mobility[at] = T::of(mass.recip());
                 tables.groups[at / GROUP] = tables.groups[at / GROUP].max(CORNERS_ALONE);
                 let (row, column) = (place / layout.columns, place % layout.columns);
@@ -91,6 +130,7 @@ pub(crate) struct SolidGrid<'a, T> {
     pub(crate) places: &'a SolidPlaces,
     pub(crate) tables: &'a SolidTables<T>,
     pub(crate) law: &'a NeoHookean<T>,
+    pub(crate) load: &'a PointLoad<T>,
     /// Displacements: three planes, edges of cubes.
     pub(crate) x: *const T,
 }
@@ -143,7 +183,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
     /// `x` has the layout's planes; `waiting` has 6 rows for each row of a plane and two more.
     #[inline(always)]
     unsafe fn row<V: Vector<Real = T>>(&self, j: usize, k: usize, waiting: *mut T, all_awake: bool, sums: &mut [V; 2]) {
-        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, law, x, .. } = self.grid;
+        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, law, load, x } = self.grid;
         let rows = places.rows_per_plane();
         let (row, layer) = (k * rows + j, stride * rows);
         let at_row = row * stride;
@@ -231,6 +271,21 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
                     before[c] = passed;
                     here[c] = V::load(x.add(c * plane + at));
                 }
+                if load.acts {
+                    let bed = V::load(tables.beds.as_ptr().add(at));
+                    // Where there is no point, nothing has a weight.
+                    let is_point = mobility.above(zero);
+                    let mut energy = zero;
+                    for c in 0..3 {
+                        n[c] = n[c].add(V::select(is_point, load.force(c, bed, here[c]), zero));
+                        if S::ENERGY {
+                            energy = energy.add(load.energy(c, bed, here[c]));
+                        }
+                    }
+                    if S::ENERGY && is_awake {
+                        self.stage.energy(column, energy.mul(V::load(tables.masses.as_ptr().add(at))));
+                    }
+                }
                 if is_awake {
                     self.stage.finish::<V, ANY>(row, at, here, n, sums);
                 }
@@ -245,6 +300,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
 pub(crate) fn gather<T: Real>(
     places: &SolidPlaces,
     law: &NeoHookean<T>,
+    load: &PointLoad<T>,
     layout: &Layout,
     u: &[T],
     place: usize,
@@ -291,7 +347,12 @@ pub(crate) fn gather<T: Real>(
             }
         }
         let [[even, odd], [even_before, odd_before]] = sums;
-        found[c] = odd.sub(even).sub(even_before.add(odd_before)).mul(mobility).0;
+        let mut force = odd.sub(even).sub(even_before.add(odd_before)).mul(mobility);
+        if load.acts && places.mass(place) > 0.0 {
+            let x = Scalar(u[c * layout.plane + layout.offset(place)]);
+            force = force.add(load.force(c, Scalar(T::of(places.bed(place))), x));
+        }
+        found[c] = force.0;
     }
     found
 }

@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 use glam::DVec3;
 
 use super::shape::{CORNERS, SolidShape};
-use crate::shape::RestShape;
+use crate::shape::{PointId, RestShape};
 
 /// Cubes of the lattice on which the vibration is looked for.
 const MIXED_CELLS: usize = 2000;
@@ -38,9 +38,9 @@ impl PartialEq for SlowestVibration {
 impl SlowestVibration {
     /// Returns ρ·a²·ω²/E of the slowest vibration ω of a solid, the same solid each time, whose cubes have the edge a; 0 if
     /// nothing holds the solid. `weights` is the stiffness of each cube relative to that of a full one; `lame` is μ/E and
-    /// λ/E.
-    pub(super) fn of(&self, shape: &SolidShape, weights: &[f64], lame: [f64; 2]) -> f64 {
-        *self.0.get_or_init(|| MixedCells::of(shape, weights, lame).slowest())
+    /// λ/E; `beds` the stiffness of the foundation of a point divided by E·a.
+    pub(super) fn of(&self, shape: &SolidShape, weights: &[f64], lame: [f64; 2], beds: impl Fn(PointId) -> f64) -> f64 {
+        *self.0.get_or_init(|| MixedCells::of(shape, weights, lame, beds).slowest())
     }
 }
 
@@ -53,6 +53,8 @@ struct MixedCells {
     masses: Vec<f64>,
     /// The stiffness of each corner if the others are held; infinite where it is fixed or there is none.
     alone: Vec<f64>,
+    /// The stiffness of the foundation of each corner.
+    beds: Vec<f64>,
     shear: f64,
     lame: f64,
 }
@@ -69,7 +71,7 @@ fn signs(corner: usize) -> [f64; 3] {
 
 impl MixedCells {
     #[allow(clippy::cast_precision_loss)]
-    fn of(shape: &SolidShape, weights: &[f64], [shear, lame]: [f64; 2]) -> Self {
+    fn of(shape: &SolidShape, weights: &[f64], [shear, lame]: [f64; 2], beds: impl Fn(PointId) -> f64) -> Self {
         let parts = shape.counted_parts();
         let inside = weights.iter().filter(|weight| **weight > 0.0).count();
         let mut by = 1;
@@ -88,8 +90,8 @@ impl MixedCells {
         let corners = cells.map(|cells| cells + 1);
         let corner = |[i, j, k]: [usize; 3]| (k * corners[1] + j) * corners[0] + i;
         let count = corners.iter().product();
-        let mut found =
-            MixedCells { by, cells: Vec::new(), masses: vec![0.0; count], alone: vec![0.0; count], shear, lame };
+        let none = || vec![0.0; count];
+        let mut found = MixedCells { by, cells: Vec::new(), masses: none(), alone: none(), beds: none(), shear, lame };
         for (at, [weight, part]) in mixed.into_iter().enumerate().filter(|(_, [weight, _])| *weight > 0.0) {
             let [i, j, k] = [at % cells[0], at / cells[0] % cells[1], at / cells[0] / cells[1]];
             let corners = CORNERS.map(|[x, y, z]| corner([i + x, j + y, k + z]));
@@ -100,10 +102,11 @@ impl MixedCells {
             found.cells.push(MixedCell { corners, weight });
         }
         for point in crate::shape::points(shape) {
-            if shape.is_fixed(point) {
-                let at = shape.corner_at(shape.corner_of(point));
-                found.alone[corner(at.map(|at| (at + (by - 1) / 2) / by))] = f64::INFINITY;
-            }
+            let at = shape.corner_at(shape.corner_of(point));
+            let nearest = corner(at.map(|at| (at + (by - 1) / 2) / by));
+            let bed = beds(point) / by as f64;
+            found.beds[nearest] += bed;
+            found.alone[nearest] += if shape.is_fixed(point) { f64::INFINITY } else { bed };
         }
         for (alone, mass) in found.alone.iter_mut().zip(&found.masses) {
             if *mass == 0.0 {
@@ -172,6 +175,9 @@ impl MixedCells {
                 let of_others = y * z * others[0] + x * z * others[1] + x * y * others[2] + x * y * z * others[3];
                 product[*point] += 0.25 * weight * (of_stress + of_others);
             }
+        }
+        for ((product, x), bed) in product.iter_mut().zip(x).zip(&self.beds) {
+            *product += *bed * *x;
         }
         self.held(&mut product);
         product

@@ -65,11 +65,13 @@ impl WorkAccount {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
         // NaN is not within it.
-        let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise.part * self.largest_j + noise.energy_j;
+        let is_within =
+            excess_j <= MARGIN * (before_j.abs() + work_j.abs()) + noise.part * self.largest_j + noise.energy_j;
         if !is_within {
             return Err(CheckFailure::Energy { energy_j, before_j, work_j });
         }
-        let largest_j = self.largest_j.max(energy_j);
+        // Below rest that of a weight is negative.
+        let largest_j = self.largest_j.max(energy_j.abs());
         *self = WorkAccount { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
         Ok(())
     }
