@@ -206,7 +206,7 @@ describe("a body of any shape", () => {
     await page.until(({ forceN }) => forceN.length === 0);
     // A solid is touched with a rigid tip.
     await page.page.check("input[value=tip]", { force: true });
-    await page.says("meaning", /a rigid disc of/);
+    assert.match((await page.page.locator("#meaning").textContent()) ?? "", /a rigid disc of/);
     await page.press();
     await felt(page);
     await page.says("touch", /deep\s*.*N back/);
