@@ -57,7 +57,9 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         stepping: Stepping {
             rate_hz: decades(&mut random, -3.0, limits.session_rate_hz.log10()),
             tolerance: decades(&mut random, -16.0, 0.0),
-            integrator: if random.bool() { Integrator::Auto } else { name(&mut random) },
+            integrator: Some(name(&mut random))
+                .filter(|named: &Integrator| named.takes_anchor_springs() && random.bool())
+                .unwrap_or(Integrator::Auto),
             substeps: random.bool().then(|| decades(&mut random, 0.0, f64::from(limits.substeps).log10()) as u32),
             precision: if random.bool() { Precision::Auto } else { name(&mut random) },
             lanes: Lanes::Auto,

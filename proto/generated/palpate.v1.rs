@@ -1455,6 +1455,7 @@ pub struct PointRecord {
     pub displacement_m: ::core::option::Option<Vector3>,
     #[prost(message, optional, tag = "3")]
     pub velocity_m_per_s: ::core::option::Option<Vector3>,
+    /// Force of springs, with the pressure of a volume; in a solid that of the cells, with viscosity, foundation and weight.
     #[prost(message, optional, tag = "4")]
     pub spring_n: ::core::option::Option<Vector3>,
     #[prost(message, optional, tag = "5")]
@@ -2562,7 +2563,7 @@ pub struct Solid {
     #[prost(double, optional, tag = "10")]
     pub viscosity_pa_s: ::core::option::Option<f64>,
     /// Stiffness of a foundation under all of the surface: each part of it is pulled back to where it rests, by this for each area and
-    /// displacement (Winkler), N/m³; 0 or more. 0 if absent.
+    /// displacement (Winkler), N/m³; 0 or more. Viscosity acts on it as on the tissue. 0 if absent.
     #[prost(double, optional, tag = "11")]
     pub foundation_n_per_m3: ::core::option::Option<f64>,
 }

@@ -28,7 +28,8 @@ pub struct PointState {
     pub displacement_m: DVec3,
     /// Velocity, m/s, at the time of the displacement.
     pub velocity_m_per_s: DVec3,
-    /// Force of all springs between points (with that of viscosity), and of an enclosed volume's pressure, N.
+    /// Force of all springs between points, and of an enclosed volume's pressure, N. In a solid that of the cells with their viscosity,
+    /// of a foundation, and the weight.
     pub spring_n: DVec3,
     /// Force of the anchor spring, −K″·u, N.
     pub anchor_n: DVec3,

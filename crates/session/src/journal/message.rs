@@ -15,7 +15,7 @@ use crate::command::{Command, Due};
 use crate::input::{Felt, Input};
 use crate::rules::Rules;
 use crate::wire::required;
-use crate::wire::scene::{from_scene, sent};
+use crate::wire::scene::{from_scene, sent, set_absent_viscosity};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
@@ -116,10 +116,7 @@ pub fn check_replays(header: &pb::Header) -> Result<()> {
 pub fn model(header: &pb::Header, given: &Limits) -> Result<Arc<Model>> {
     let limits = limits(given);
     let mut message = required("scene", header.scene.as_ref())?.clone();
-    if let Some(solid) = &mut message.solid {
-        // A journal from before solids were viscous.
-        solid.viscosity_pa_s.get_or_insert(0.0);
-    }
+    set_absent_viscosity(&mut message);
     let beside = header.mesh.as_ref().map(|mesh| from_mesh(mesh, &limits)).transpose()?;
     let mut scene = from_scene(&message, beside.as_ref()).map_err(|refusal| refusal.within("scene"))?;
     if let Some(appearance) = &header.appearance {

@@ -392,9 +392,18 @@ pub fn from_told(message: &pb::Scene, mesh: &TriangleMesh) -> Result<Scene> {
     if even.solid.is_some() {
         (even.springs, even.anchor_springs, even.damping) = (None, None, None);
     }
+    set_absent_viscosity(&mut even);
     // Scripts name the vertices of the file. Only the server knows which point of a coarser mesh each one belongs to.
     even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
     from_scene(&even, Some(mesh))
+}
+
+/// Makes a solid elastic of which nothing says how viscous it is, in a scene that is not a client's: a server or a journal from before
+/// solids were viscous.
+pub(crate) fn set_absent_viscosity(message: &mut pb::Scene) {
+    if let Some(solid) = &mut message.solid {
+        solid.viscosity_pa_s.get_or_insert(0.0);
+    }
 }
 
 /// Returns a scene as a message, with all defaults filled in and the coefficients that follow from a material. The

@@ -143,6 +143,8 @@ pub struct Solid {
     foundation_n_per_m3: f64,
     /// The area of the surface that each point carries, in faces of a cube; empty without a foundation.
     areas: Arc<[f64]>,
+    /// The largest stiffness of the foundation at a point that moves, divided by its relative mass, N/m.
+    foundation_bound_n_per_m: f64,
     gravity: Gravity,
     slowest: SlowestVibration,
 }
@@ -181,6 +183,7 @@ impl Solid {
             largest_factor: 1.0,
             foundation_n_per_m3: 0.0,
             areas: Arc::default(),
+            foundation_bound_n_per_m: 0.0,
             gravity: Gravity::default(),
             slowest: SlowestVibration::default(),
             shape,
@@ -204,20 +207,23 @@ impl Solid {
     /// displacement (Winkler), N/m³.
     ///
     /// # Errors
-    /// Refuses a negative number, and 0 if no point is fixed, with the field `solid.foundation_n_per_m3`.
+    /// Refuses a negative number, and 0 if no point is fixed, with the fields `solid.foundation_n_per_m3` and `solid.fixed`.
     pub fn with_foundation(&self, n_per_m3: f64) -> Result<Self> {
         const FIELD: &str = "solid.foundation_n_per_m3";
         if not_negative(FIELD, n_per_m3)? > 0.0 {
             physical(FIELD, n_per_m3)?;
         } else if self.shape.fixed().is_empty() {
-            return Err(Refusal::new(
-                Reason::Missing,
-                FIELD,
-                "is missing: nothing else holds a solid without fixed points",
-            ));
+            let message = "is missing: name a part that does not move, or give foundation_n_per_m3";
+            return Err(Refusal::new(Reason::Missing, "solid.fixed", message));
         }
         let areas = if n_per_m3 > 0.0 { support::areas(&self.shape).into() } else { Arc::default() };
-        Ok(Solid { foundation_n_per_m3: n_per_m3, areas, slowest: SlowestVibration::default(), ..self.clone() })
+        let mut solid =
+            Solid { areas, foundation_n_per_m3: n_per_m3, slowest: SlowestVibration::default(), ..self.clone() };
+        let moves = |point: &PointId| !solid.shape.is_fixed(*point);
+        let of_mass = |point: PointId| solid.foundation_n_per_m(point) / solid.relative_mass(point);
+        let bound = crate::shape::points(&*solid.shape).filter(moves).map(of_mass).fold(0.0, f64::max);
+        solid.foundation_bound_n_per_m = bound;
+        Ok(solid)
     }
 
     /// Returns the solid under gravity.
@@ -446,9 +452,7 @@ impl BodyKind for Solid {
     }
 
     fn spring_bound_n_per_m(&self, springs: &Springs, _anchor_n_per_m: f64) -> f64 {
-        let of_mass = |point: PointId| self.foundation_n_per_m(point) / self.relative_mass(point);
-        let by_foundation = crate::shape::points(&*self.shape).map(of_mass).fold(0.0, f64::max);
-        springs.stiffness_n_per_m * self.bound() + by_foundation
+        springs.stiffness_n_per_m * self.bound() + self.foundation_bound_n_per_m
     }
 
     /// Returns m·ω² of the slowest vibration ω. With forces on the points that are at most m·ω²·d of each mass m, the
@@ -549,7 +553,8 @@ pub(super) fn read_material(
         }
     }
     let Some(material) = material else { return Err(fields.refuse(Reason::Missing, "material", "is missing")) };
-    let solid = Solid { material: material.table(SolidMaterial::read)?, ..solid.clone() };
+    let material = material.table(SolidMaterial::read)?;
+    let solid = Solid { material, slowest: SlowestVibration::default(), ..solid.clone() };
     let solid = solid.with_gravity(gravity.map_or(Ok(Gravity::default()), Gravity::read)?);
     let Some(layers) = layers else { return Ok(solid) };
     solid.with_layers(&layers.tables()?.iter().map(Layer::read).collect::<Result<Vec<_>>>()?, "layer")

@@ -26,7 +26,7 @@ pub struct TwoStep<const KEEPS: bool> {
     pub q: f64,
     /// a = K″·dt²/m, the pull of the anchor spring.
     pub a: f64,
-    /// Weights of N₀, N₋₁ and N₋₂; 1, 0 and 0 without `KEEPS`.
+    /// Weights of N₀, N₋₁ and N₋₂; without `KEEPS` 1, 0 and 0.
     pub springs: [f64; 3],
 }
 
@@ -149,7 +149,7 @@ pub(crate) struct CentralAdvance<T, const KEEPS: bool> {
     p: T,
     pull: T,
     springs: [T; 3],
-    /// Whether damping is almost zero, also that of viscosity, so that d·d₊ is twice the kinetic energy that the scheme conserves.
+    /// Whether damping is almost zero, and no earlier force counts, so that d·d₊ is twice the kinetic energy that the scheme conserves.
     keeps: bool,
 }
 

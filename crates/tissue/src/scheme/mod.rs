@@ -94,7 +94,7 @@ pub(crate) struct Entry {
 pub(crate) const CANDIDATES: [Integrator; 4] =
     [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Central];
 
-/// The same of a viscous tissue, which damps what `stormer` does not show well.
+/// The same for a viscous tissue: viscosity damps the fast vibrations of which `stormer` has a large error.
 const CANDIDATES_OF_VISCOUS: [Integrator; 4] =
     [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Stormer];
 

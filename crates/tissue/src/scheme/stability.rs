@@ -83,7 +83,7 @@ pub fn least_substeps(step_s: f64, oscillator: &Oscillator) -> u32 {
 
 /// Returns about the fewest substeps in a step of `step_s`, s, with which an integrator is stable
 /// ([`is_stable`]). It tries upwards from [`least_substeps`], an eighth more each time. It ends, even if the
-/// test never succeeds, where the fastest vibration turns by 0.1 rad in a substep and C·dt/m is at most 1:
+/// test never succeeds, where the fastest vibration turns by 0.1 rad in a substep, C·dt/m is at most 1 and τ·ω²·dt at most 0.1:
 /// there every scheme is stable but for rounding. Saturates at `u32::MAX`.
 pub fn stable_substeps(integrator: Integrator, step_s: f64, oscillator: &Oscillator) -> u32 {
     let mut substeps = least_substeps(step_s, oscillator);
@@ -92,9 +92,12 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, oscillator: &Oscilla
         let scheme = Scheme::fit(integrator, oscillator.scaled(substep_s));
         is_stable(&scheme, oscillator.scaled_spring_stiffness(substep_s))
     };
-    // All schemes are stable up to dt·ω = 0.3 even without damping, and up to dt·C/m = 2 (`rk4` to 2.785);
-    // because of rounding, the test may never succeed.
-    let fastest_per_s = (oscillator.omega_bound_per_s() / 0.1).max(oscillator.damping_n_s_per_m / oscillator.mass_kg);
+    // All schemes are stable up to dt·ω = 0.3 even without damping, up to dt·C/m = 2 (`rk4` to 2.785), and where viscosity decides up to
+    // dt·τ·ω² = 0.11 (`exponential4`; `central` to 1); because of rounding, the test may never succeed.
+    let omega_per_s = oscillator.omega_bound_per_s();
+    let by_viscosity_per_s = oscillator.viscous_time_s * omega_per_s * omega_per_s / 0.1;
+    let by_damping_per_s = oscillator.damping_n_s_per_m / oscillator.mass_kg;
+    let fastest_per_s = (omega_per_s / 0.1).max(by_damping_per_s).max(by_viscosity_per_s);
     let most = (step_s * fastest_per_s).min(f64::from(u32::MAX));
     while !stable(substeps) && f64::from(substeps) < most {
         substeps = substeps.saturating_add(substeps / 8 + 1);
@@ -107,18 +110,20 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, oscillator: &Oscilla
 /// what makes them as accurate as they promise:
 ///
 /// dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤ 1, half of its bound 2
-/// (W + 2g < 4 with W = 0). Saturates at `u32::MAX`.
+/// (W + 2g < 4 with W = 0). A viscous tissue gets at least [`stable_substeps`]. Saturates at `u32::MAX`.
 pub fn substeps(integrator: Integrator, step_s: f64, oscillator: &Oscillator) -> u32 {
     let decay_s = 2.0 * oscillator.mass_kg / oscillator.damping_n_s_per_m;
     let omega = oscillator.omega_bound_per_s();
     let turn = || substeps_of_turn(step_s, omega, THETA / endurance(omega, decay_s));
     // Half the stable damping, so that light points do not ring with the substep.
     let lag = || substeps_of_turn(step_s, oscillator.damping_n_s_per_m / oscillator.mass_kg, 1.0);
-    match entry(integrator).bound {
-        Bound::Stable => stable_substeps(integrator, step_s, oscillator),
+    let stable = || stable_substeps(integrator, step_s, oscillator);
+    let accurate = match entry(integrator).bound {
+        Bound::Stable => return stable(),
         Bound::Turn => turn(),
         Bound::TurnAndLag => turn().max(lag()),
-    }
+    };
+    if oscillator.viscous_time_s > 0.0 { accurate.max(stable()) } else { accurate }
 }
 
 /// Returns the fewest substeps, at least 1, with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps; in s,
@@ -259,6 +264,26 @@ mod tests {
                 let (scheme, limit) = (Scheme::fit(integrator, of), 4.0 / (own + 4.0 * viscosity));
                 assert!(is_stable(&scheme, 0.999 * limit), "{integrator:?} {viscosity}");
                 assert!(!is_stable(&scheme, 1.001 * limit), "{integrator:?} {viscosity}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_scheme_gets_enough_substeps_for_any_viscosity() {
+        for viscous_time_s in [1e-6, 1e-5, 1e-4, 1e-3, 1e-2] {
+            let oscillator = Oscillator {
+                mass_kg: 1e-5,
+                damping_n_s_per_m: 2e-4,
+                anchor_stiffness_n_per_m: 0.0,
+                spring_stiffness_n_per_m: 300.0,
+                viscous_time_s,
+            };
+            for integrator in all().filter(|integrator| *integrator != Integrator::Rk4) {
+                let substeps = substeps(integrator, 1e-3, &oscillator);
+                let substep_s = 1e-3 / f64::from(substeps);
+                let scheme = Scheme::fit(integrator, oscillator.scaled(substep_s));
+                let stiffness = oscillator.scaled_spring_stiffness(substep_s);
+                assert!(is_stable(&scheme, stiffness), "{integrator:?} {viscous_time_s}: {substeps}");
             }
         }
     }

@@ -1,5 +1,5 @@
-//! Störmer's scheme: central differences whose springs' force includes its second difference. Third order but for damping and tools,
-//! which enter as in `central`: second order, with a small error where the springs count most. For tissue without anchor springs.
+//! Störmer's scheme: central differences whose springs' force includes its second difference. Third order but for damping,
+//! viscosity and tools, which enter as in `central`: second order, with a small error where the springs count most. For tissue without anchor springs.
 //!
 //! u₊ − 2u + u₋ = ∫₋₁¹ (1 − |s|)·N(s) ds = N + (N − 2N₋₁ + N₋₂)/12 with the parabola through the last three forces (Hairer,
 //! Nørsett, Wanner I, III.10). A viscous tissue pulls with N + β·Ṅ (`central`). Stable for (dt·ω)²·(4/3 + 4β) < 4: of all

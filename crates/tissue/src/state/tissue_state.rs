@@ -109,6 +109,7 @@ impl<T: Real> TissueState<T> {
         if model.places.is_pulled() {
             tissue.tiles.wake_all();
             tissue.write(Write::Begin);
+            tissue.begin_account();
         }
         tissue
     }

@@ -59,13 +59,10 @@ impl FixedPart {
     pub(super) fn read_list(item: &Item<'_>) -> Result<Vec<Self>> {
         if item.as_text().is_some() {
             return Err(item.wrong(
-                "a list of planes { plane_m, normal, within_m }, balls { centre_m, radius_m } and groups { group }",
+                "\"none\", or a list of planes { plane_m, normal, within_m }, balls { centre_m, radius_m } and groups { group }",
             ));
         }
         let Ok(items) = item.list() else { return Ok(vec![read_part(item)?]) };
-        if items.is_empty() {
-            return Err(item.refuse(Reason::Missing, "names no part: without one, nothing would hold the solid"));
-        }
         items.iter().map(read_part).collect()
     }
 
