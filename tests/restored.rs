@@ -88,8 +88,10 @@ fn scene(random: &mut Rng) -> Scene {
             scene
         }
     };
-    let schemes = &Integrator::NAMES[if precision == Precision::Compensated { 4 } else { 1 }..7];
-    scene.stepping.integrator = schemes[random.usize(0..schemes.len())].1;
+    let suits =
+        |integrator: &Integrator| precision != Precision::Compensated || integrator.name().starts_with("exponential");
+    let schemes: Vec<Integrator> = Integrator::of_anchored().filter(suits).collect();
+    scene.stepping.integrator = schemes[random.usize(0..schemes.len())];
     scene.stepping.substeps = Some(if scene.sheet().is_some() { random.u32(1..6) } else { random.u32(4..16) });
     scene.sleep_tolerance = [None, Some(0.0), Some(1e-3), Some(5e-2)][random.usize(0..4)];
     scene

@@ -365,7 +365,8 @@ fn tissues(case: &mut SnapshotCase, random: &mut Rng, on_mesh: bool) {
         case.events.entry(random.u64(0..case.steps)).or_default().push(SessionEvent::Change(change));
     }
     for _ in 0..random.usize(0..2) {
-        let integrator = Integrator::NAMES[random.usize(1..7)].1;
+        let integrators: Vec<Integrator> = Integrator::of_anchored().collect();
+        let integrator = integrators[random.usize(0..integrators.len())];
         let step = random.u64(0..case.steps);
         let own = case.model();
         let compensates = integrator.name().starts_with("exponential");

@@ -12,9 +12,9 @@ use palpate_tissue::scene::{BUILT_IN, Integrator, Named, Scene};
 
 /// The key of each name below.
 pub const INTEGRATOR: &str = "stepping.integrator";
-/// Every scheme, the paper's first.
+/// Every scheme of a sheet, the paper's first.
 pub fn integrators() -> Vec<&'static str> {
-    let mut names: Vec<_> = Integrator::NAMES[1..7].iter().map(|entry| entry.0).collect();
+    let mut names: Vec<_> = Integrator::of_anchored().map(Named::name).collect();
     names.sort_by_key(|name| *name != "lagged");
     names
 }

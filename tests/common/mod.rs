@@ -37,8 +37,7 @@ pub fn script(text: &str, scene: &Scene) -> Script {
 
 /// The names of all schemes.
 pub fn schemes() -> impl Iterator<Item = &'static str> {
-    let of_sheets = |entry: &&(&str, Integrator)| entry.1 != Integrator::Auto && entry.1.takes_anchor_springs();
-    Integrator::NAMES.iter().filter(of_sheets).map(|entry| entry.0)
+    Integrator::of_anchored().map(Named::name)
 }
 
 /// A session with a script's profiles acting.

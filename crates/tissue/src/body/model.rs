@@ -77,6 +77,8 @@ pub struct Plan {
     /// The moments of a substep at which the tools' force is evaluated, with their weights: [`Scheme::nodes`]
     /// of `scheme`.
     pub nodes: Vec<QuadratureNode>,
+    /// The weights of the springs' force now and of the kept ones in that of viscosity: [`Scheme::viscous_weights`].
+    pub(crate) viscous_weights: Vec<f64>,
     /// Whether the substep is within the stability bound ([`stability::is_stable`]). Only a number of substeps
     /// that the scene gives can be beyond it; then the model has a warning.
     pub stable: bool,
@@ -92,9 +94,10 @@ impl Plan {
     /// Creates a plan without checking its stability; a rehearsal detects an instability itself.
     pub(crate) fn unjudged(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let substep_s = step_s / f64::from(substeps);
-        let scheme = Scheme::fit(integrator, sheet.scaled(substep_s));
-        let nodes = scheme.nodes();
-        Plan { integrator, substeps, substep_s, scheme, nodes, stable: true }
+        let scaled = sheet.scaled(substep_s);
+        let scheme = Scheme::fit(integrator, scaled);
+        let (nodes, viscous_weights) = (scheme.nodes(), scheme.viscous_weights(scaled.viscosity));
+        Plan { integrator, substeps, substep_s, scheme, nodes, viscous_weights, stable: true }
     }
 
     /// Returns the same scheme with `by` times the substeps.

@@ -395,6 +395,12 @@ impl Integrator {
     pub fn takes_anchor_springs(self) -> bool {
         self != Integrator::Stormer
     }
+
+    /// Returns the integrators that step tissue with anchor springs, without `auto`, in the order of [`Named::NAMES`].
+    pub fn of_anchored() -> impl Iterator<Item = Self> {
+        let all = Self::NAMES.iter().map(|entry| entry.1);
+        all.filter(|integrator| *integrator != Integrator::Auto && integrator.takes_anchor_springs())
+    }
 }
 
 named! {

@@ -21,17 +21,19 @@ use crate::shape::{CellPlace, PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
 
 mod fixed;
+mod foundation;
+mod gravity;
 mod layer;
 mod shape;
 mod slowest;
-mod support;
 
 pub use fixed::FixedPart;
+use foundation::Foundation;
+pub use gravity::Gravity;
 pub use layer::Layer;
 use shape::places_in_cube;
 pub use shape::{CellSize, SolidShape};
 use slowest::SlowestVibration;
-pub use support::Gravity;
 
 /// Largest Poisson's ratio. Towards ½ the number of substeps grows without bound.
 const MAX_POISSON: f64 = 0.495;
@@ -139,12 +141,7 @@ pub struct Solid {
     /// The factor of E of each cube that its layers give.
     layer_factors: Arc<[f64]>,
     largest_factor: f64,
-    /// Stiffness of the foundation under the surface, N/m³; 0 without one.
-    foundation_n_per_m3: f64,
-    /// The area of the surface that each point carries, in faces of a cube; empty without a foundation.
-    areas: Arc<[f64]>,
-    /// The largest stiffness of the foundation at a point that moves, divided by its relative mass, N/m.
-    foundation_bound_n_per_m: f64,
+    foundation: Foundation,
     gravity: Gravity,
     slowest: SlowestVibration,
 }
@@ -181,9 +178,7 @@ impl Solid {
             masses,
             layers: Arc::default(),
             largest_factor: 1.0,
-            foundation_n_per_m3: 0.0,
-            areas: Arc::default(),
-            foundation_bound_n_per_m: 0.0,
+            foundation: Foundation::default(),
             gravity: Gravity::default(),
             slowest: SlowestVibration::default(),
             shape,
@@ -216,14 +211,9 @@ impl Solid {
             let message = "is missing: name a part that does not move, or give foundation_n_per_m3";
             return Err(Refusal::new(Reason::Missing, "solid.fixed", message));
         }
-        let areas = if n_per_m3 > 0.0 { support::areas(&self.shape).into() } else { Arc::default() };
-        let mut solid =
-            Solid { areas, foundation_n_per_m3: n_per_m3, slowest: SlowestVibration::default(), ..self.clone() };
-        let moves = |point: &PointId| !solid.shape.is_fixed(*point);
-        let of_mass = |point: PointId| solid.foundation_n_per_m(point) / solid.relative_mass(point);
-        let bound = crate::shape::points(&*solid.shape).filter(moves).map(of_mass).fold(0.0, f64::max);
-        solid.foundation_bound_n_per_m = bound;
-        Ok(solid)
+        let new = || Foundation::new(n_per_m3, &self.shape, &self.masses);
+        let foundation = if n_per_m3 > 0.0 { new() } else { Foundation::default() };
+        Ok(Solid { foundation, slowest: SlowestVibration::default(), ..self.clone() })
     }
 
     /// Returns the solid under gravity.
@@ -233,7 +223,7 @@ impl Solid {
 
     /// Returns the stiffness of the foundation, N/m³; 0 without one.
     pub fn foundation_n_per_m3(&self) -> f64 {
-        self.foundation_n_per_m3
+        self.foundation.n_per_m3
     }
 
     /// Returns the gravity.
@@ -243,8 +233,7 @@ impl Solid {
 
     /// Returns the stiffness with which the foundation pulls a point back, N/m.
     pub(crate) fn foundation_n_per_m(&self, point: PointId) -> f64 {
-        let area_m2 = self.areas.get(point.index()).copied().unwrap_or(0.0) * self.shape.lattice().edge_m.powi(2);
-        self.foundation_n_per_m3 * area_m2
+        self.foundation.n_per_m(point)
     }
 
     /// Returns the layers, from the surface inward.
@@ -363,7 +352,7 @@ impl KindOfBody for Solid {
         let (source, size) = (self.shape.source().clone(), CellSize::Edge(cell_m));
         let shape = SolidShape::of(source, size, self.shape.fixed(), &Limits::default()).ok()?;
         let solid = Solid::new(Arc::new(shape), self.material).with_layers(&self.layers, "layer").ok()?;
-        solid.with_foundation(self.foundation_n_per_m3).map(|solid| solid.with_gravity(self.gravity)).ok()
+        solid.with_foundation(self.foundation.n_per_m3).map(|solid| solid.with_gravity(self.gravity)).ok()
     }
 
     /// A block of full cubes of the stiffest material, held below.
@@ -436,9 +425,9 @@ impl BodyKind for Solid {
             add(&number.to_bits().to_le_bytes());
         }
         cells.iter().for_each(|count| add(&(*count as u64).to_le_bytes()));
-        if self.foundation_n_per_m3 > 0.0 || self.gravity != Gravity::default() {
+        if self.foundation.n_per_m3 > 0.0 || self.gravity != Gravity::default() {
             let pull_m_per_s2 = self.gravity.pull_m_per_s2().to_array();
-            let numbers = pull_m_per_s2.into_iter().chain([self.foundation_n_per_m3]);
+            let numbers = pull_m_per_s2.into_iter().chain([self.foundation.n_per_m3]);
             numbers.for_each(|number| add(&number.to_bits().to_le_bytes()));
         }
         self.weights.iter().for_each(|weight| add(&weight.to_bits().to_le_bytes()));
@@ -452,7 +441,7 @@ impl BodyKind for Solid {
     }
 
     fn spring_bound_n_per_m(&self, springs: &Springs, _anchor_n_per_m: f64) -> f64 {
-        springs.stiffness_n_per_m * self.bound() + self.foundation_bound_n_per_m
+        springs.stiffness_n_per_m * self.bound() + self.foundation.bound_n_per_m
     }
 
     /// Returns m·ω² of the slowest vibration ω. With forces on the points that are at most m·ω²·d of each mass m, the

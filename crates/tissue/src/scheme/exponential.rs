@@ -104,13 +104,12 @@ pub(super) fn fit<const ORDER: usize>(of: Coefficients) -> Multistep<ORDER> {
     let linear = std::array::from_fn(|i| std::array::from_fn(|j| solution.at(i, j) - f64::from(u8::from(i == j))));
 
     // Values are at s = 0, −1, …, 1 − p.
-    let nodes = || (0..ORDER).map(|i| -(i as f64));
-    let through: Vec<Vec<f64>> = nodes().map(|node| basis(node, nodes().filter(move |other| *other != node))).collect();
+    let through = through_values(ORDER);
     let pulls = |polynomial: &[f64]| integral(&moments, &viscous(polynomial, viscosity));
     let predictor: Vec<[f64; 2]> = through.iter().map(|polynomial| pulls(polynomial)).collect();
     // A polynomial's value at s = 1 is the sum of its coefficients.
     let extrapolation: Vec<f64> = through.iter().map(|polynomial| polynomial.iter().sum()).collect();
-    let correction = pulls(&basis(1.0, nodes()));
+    let correction = pulls(&basis(1.0, (0..ORDER).map(|i| -(i as f64))));
     let carried: [f64; 2] = std::array::from_fn(|row| {
         correction[row]
             + (0..2)
@@ -228,10 +227,15 @@ impl<const ORDER: usize> Family for Multistep<ORDER> {
 }
 
 /// Returns the weights of `count` values now, a substep ago, …, in the rate at which the polynomial through them changes now.
-#[allow(clippy::cast_precision_loss)]
 pub(super) fn rate_weights(count: usize) -> Vec<f64> {
+    through_values(count).into_iter().map(|polynomial| polynomial[1]).collect()
+}
+
+/// Returns the polynomials, in rising powers, that values at 0, −1, … multiply in the one through `count` of them.
+#[allow(clippy::cast_precision_loss)]
+fn through_values(count: usize) -> Vec<Vec<f64>> {
     let nodes = || (0..count).map(|i| -(i as f64));
-    nodes().map(|node| basis(node, nodes().filter(move |other| *other != node))).map(|weight| weight[1]).collect()
+    nodes().map(|node| basis(node, nodes().filter(move |other| *other != node))).collect()
 }
 
 /// Converts forces now and in substeps before to those of a substep that is `ratio` times as long, in its unit.

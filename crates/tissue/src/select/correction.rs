@@ -120,10 +120,8 @@ mod tests {
         // Without work for rehearsals no other scheme is looked for.
         let limits = Limits { rehearsal_work: 0, ..Limits::default() };
         // tests/reference.rs measures the orders.
-        for (name, integrator) in
-            Integrator::NAMES.iter().filter(|entry| entry.1 != Integrator::Auto && entry.1.takes_anchor_springs())
-        {
-            let (order, integrator) = (order(*integrator), format!("stepping.integrator={name}"));
+        for integrator in Integrator::of_anchored() {
+            let (order, integrator) = (order(integrator), format!("stepping.integrator={}", integrator.name()));
             let sets = [&integrator, "sheet.points=[3, 3]", "stepping.substeps=4", "stepping.tolerance=1e-4"];
             let correction = Model::paper(&sets).correction(&finding(2e-3, Origin::Substep), 70, &limits).unwrap();
             // An error of order p falls with the p-th power of the substep: from 2e-3 to half of the tolerance.

@@ -32,8 +32,6 @@ pub(super) struct PointReader<'a, T: Real> {
     pub(super) observer: Observer<f64>,
     /// [`Plan::spring_unit`].
     pub(super) spring_unit: f64,
-    /// [`Scheme::viscous_weights`](crate::scheme::Scheme::viscous_weights).
-    pub(super) viscous_weights: Vec<f64>,
 }
 
 impl<T: Real> PointReader<'_, T> {
@@ -130,10 +128,10 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
             found[1][c] = if still { 0.0 } else { w.0 * model.unit_m / plan.substep_s };
             // At rest nothing resists.
             let mut viscous = 0.0;
-            if !still && !reader.viscous_weights.is_empty() {
-                viscous = reader.viscous_weights[0] * n.0;
-                for k in 1..reader.viscous_weights.len() {
-                    viscous += reader.viscous_weights[k] * kept[k - 1].0;
+            if !still && !plan.viscous_weights.is_empty() {
+                viscous = plan.viscous_weights[0] * n.0;
+                for k in 1..plan.viscous_weights.len() {
+                    viscous += plan.viscous_weights[k] * kept[k - 1].0;
                 }
             }
             found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0 + viscous, state.u[at].wide());

@@ -162,7 +162,6 @@ impl<T: Real> TissueState<T> {
             volume_change: self.volume_change(),
             observer: Observer::of(&plan.scheme),
             spring_unit: plan.spring_unit(&model.scene),
-            viscous_weights: plan.scheme.viscous_weights(model.scene.body.kind().viscous_time_s() / plan.substep_s),
         }
     }
 

@@ -13,8 +13,7 @@ use palpate_haptics::Tip;
 
 /// The names of all schemes.
 fn schemes() -> impl Iterator<Item = &'static str> {
-    let of_sheets = |entry: &&(&str, Integrator)| entry.1 != Integrator::Auto && entry.1.takes_anchor_springs();
-    Integrator::NAMES.iter().filter(of_sheets).map(|entry| entry.0)
+    Integrator::of_anchored().map(Named::name)
 }
 
 fn sheet(integrator: &str) -> TissueState<f64> {
