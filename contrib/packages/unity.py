@@ -15,6 +15,21 @@ from pathlib import Path
 
 TAIL = "  userData: \n  assetBundleName: \n  assetBundleVariant: \n"
 SIMPLE = "  externalObjects: {}\n" + TAIL
+
+
+def native(system, player):
+    """Returns the importer of a library for x86_64 that the editor on one system, and players for it, load."""
+    return (
+        "PluginImporter:\n  externalObjects: {}\n  serializedVersion: 2\n  iconMap: {}\n  executionOrder: {}\n"
+        "  defineConstraints: []\n  isPreloaded: 0\n  isOverridable: 0\n  isExplicitlyReferenced: 0\n  validateReferences: 1\n"
+        "  platformData:\n"
+        "  - first:\n      Any: \n    second:\n      enabled: 0\n      settings: {}\n"
+        "  - first:\n      Editor: Editor\n    second:\n      enabled: 1\n      settings:\n        CPU: x86_64\n"
+        f"        DefaultValueInitialized: true\n        OS: {system}\n"
+        f"  - first:\n      Standalone: {player}\n    second:\n      enabled: 1\n      settings:\n        CPU: x86_64\n" + TAIL
+    )
+
+
 IMPORTERS = {
     ".cs": "MonoImporter:\n  externalObjects: {}\n  serializedVersion: 2\n  defaultReferences: []\n  executionOrder: 0\n"
     "  icon: {instanceID: 0}\n" + TAIL,
@@ -22,18 +37,16 @@ IMPORTERS = {
     ".md": "TextScriptImporter:\n" + SIMPLE,
     ".txt": "TextScriptImporter:\n" + SIMPLE,
     "package.json": "PackageManifestImporter:\n" + SIMPLE,
-    # Loaded on Linux alone, by the editor and by players.
-    ".so": "PluginImporter:\n  externalObjects: {}\n  serializedVersion: 2\n  iconMap: {}\n  executionOrder: {}\n"
-    "  defineConstraints: []\n  isPreloaded: 0\n  isOverridable: 0\n  isExplicitlyReferenced: 0\n  validateReferences: 1\n"
-    "  platformData:\n"
-    "  - first:\n      Any: \n    second:\n      enabled: 0\n      settings: {}\n"
-    "  - first:\n      Editor: Editor\n    second:\n      enabled: 1\n      settings:\n        CPU: x86_64\n"
-    "        DefaultValueInitialized: true\n        OS: Linux\n"
-    "  - first:\n      Standalone: Linux64\n    second:\n      enabled: 1\n      settings:\n        CPU: x86_64\n" + TAIL,
+    ".unity": "DefaultImporter:\n" + SIMPLE,
+    ".so": native("Linux", "Linux64"),
+    ".dll": native("Windows", "Win64"),
 }
+SYSTEMS = {".so": "Linux", ".dll": "Windows"}
+# Unity's own assets, such as the usual material.
+OWN_GUIDS = {"0" * 16 + "f" + "0" * 15, "0" * 16 + "e" + "0" * 15}
 SAMPLE = {
     "displayName": "Touch",
-    "description": "Creates a tissue and a tool in code; needs a server at http://127.0.0.1:7117.",
+    "description": "A scene with a tissue and a tool that you move; needs a server at http://127.0.0.1:7117.",
     "path": "Samples~/Touch",
 }
 
@@ -53,12 +66,21 @@ def meta_of(path):
 def complete(folder, version):
     manifest = json.loads((folder / "package.json").read_text())
     manifest["version"] = version
-    manifest["description"] = "Soft tissue of a Palpate server as a Mesh, and a tool that touches it. Linux, x86_64."
+    systems = " and ".join(name for suffix, name in SYSTEMS.items() if list(folder.rglob(f"*{suffix}")))
+    manifest["description"] = f"Soft tissue of a Palpate server as a Mesh, and a tool that touches it. {systems}, x86_64."
     manifest["license"] = "MIT OR Apache-2.0"
     manifest["samples"] = [SAMPLE]
     (folder / "package.json").write_text(json.dumps(manifest, indent=2) + "\n")
+
+    def guid_of(path):
+        return hashlib.md5(f"{manifest['name']}/{path.relative_to(folder).as_posix()}".encode()).hexdigest()
+
+    for scene in folder.rglob("*.unity"):
+        # A scene names a script by its file.
+        text = re.sub(r"guid: (\w+\.cs)\b", lambda found: f"guid: {guid_of(scene.with_name(found[1]))}", scene.read_text())
+        scene.write_text(text)
     for path in assets(folder):
-        guid = hashlib.md5(f"{manifest['name']}/{path.relative_to(folder).as_posix()}".encode()).hexdigest()
+        guid = guid_of(path)
         if path.is_dir():
             importer = "folderAsset: yes\nDefaultImporter:\n" + SIMPLE
         else:
@@ -102,12 +124,29 @@ def check(folder):
     for path in folder.rglob("*.meta"):
         if not path.with_suffix("").exists():
             yield f"{path.relative_to(folder)} is the .meta file of nothing"
+    for scene in folder.rglob("*.unity"):
+        yield from check_scene(scene, set(guids) | OWN_GUIDS, folder)
     for name, path in assemblies.items():
         for reference in json.loads(path.read_text()).get("references", []):
             if reference not in assemblies:
                 yield f"{path.relative_to(folder)} refers to {reference}, which is no assembly of this package"
         if path.stem != name:
             yield f"{path.relative_to(folder)} defines the assembly {name}"
+
+
+def check_scene(scene, guids, folder):
+    """Yields the references of a scene that lead nowhere."""
+    text, name = scene.read_text(), scene.relative_to(folder)
+    objects = re.findall(r"^--- !u!\d+ &(\d+)$", text, re.MULTILINE)
+    if len(objects) != len(set(objects)):
+        yield f"{name} has two objects of one number"
+    for number, guid in re.findall(r"\{fileID: (\d+)(?:, guid: ([^,}]+), type: \d)?\}", text):
+        if guid and guid not in guids:
+            yield f"{name} refers to the asset {guid}, which is not there"
+        if not guid and number != "0" and number not in objects:
+            yield f"{name} refers to its object {number}, which is not there"
+    if "MainCamera" not in text:
+        yield f"{name} has no main camera"
 
 
 def main():

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -124,6 +125,43 @@ class Archives(unittest.TestCase):
             self.assertEqual((folder / "a.zip").read_bytes(), (folder / "b.zip").read_bytes())
             with zipfile.ZipFile(folder / "a.zip") as archive:
                 self.assertEqual(archive.namelist(), ["package/bin/palpate.dll", "package/palpate.h"])
+
+
+class Unity(unittest.TestCase):
+    def complete(self, folder):
+        """Fills the folder of a package as unity.sh does, with files in place of libraries."""
+        source = ROOT / "clients" / "csharp"
+        package = folder / "package"
+        shutil.copytree(source / "unity", package)
+        shutil.copy(source / "Palpate.cs", package / "Runtime")
+        plugins = package / "Plugins" / "x86_64"
+        plugins.mkdir(parents=True)
+        for library in ("libpalpate.so", "palpate.dll"):
+            (plugins / library).write_bytes(b"a library")
+        for name in ("LICENSE.md", "CHANGELOG.md"):
+            (package / name).write_text("a text")
+        pack("unity.py", "complete", package, "1.2.3")
+        return package
+
+    def test_each_system_loads_its_own_library(self):
+        with tempfile.TemporaryDirectory() as folder:
+            plugins = self.complete(pathlib.Path(folder)) / "Plugins" / "x86_64"
+            for library, system, player in (("libpalpate.so", "Linux", "Linux64"), ("palpate.dll", "Windows", "Win64")):
+                meta = (plugins / f"{library}.meta").read_text()
+                self.assertEqual(re.findall(r"OS: (\w+)|Standalone: (\w+)", meta), [(system, ""), ("", player)], library)
+
+    def test_the_sample_scene_refers_to_what_is_there(self):
+        with tempfile.TemporaryDirectory() as folder:
+            package = self.complete(pathlib.Path(folder))
+            sample = package / "Samples~" / "Touch"
+            guid = re.search(r"^guid: (\w+)$", (sample / "TouchSample.cs.meta").read_text(), re.MULTILINE)[1]
+            scene = (sample / "Touch.unity").read_text()
+            self.assertIn(f"guid: {guid}", scene)
+            for now, then, wrong in ((guid, "0" * 32, "asset"), ("fileID: 302}", "fileID: 303}", "object 303")):
+                (sample / "Touch.unity").write_text(scene.replace(now, then))
+                with self.assertRaises(subprocess.CalledProcessError) as refused:
+                    pack("unity.py", "check", package)
+                self.assertIn(wrong, refused.exception.stderr)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-// A tissue and a tool, made in code: put this component on an empty object of an empty scene with a camera, and press Play.
+// A tissue and a tool, made in code. The scene Touch has this component on an object, a camera and a light: open it, and press Play.
 // Palpate's tests do not build it, because they have no Unity.
 using UnityEngine;
 
