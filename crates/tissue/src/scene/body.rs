@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use palpate_geometry::TriangleMesh;
 
+use super::Integrator;
 use super::graph::MeshGraph;
 use super::profile::Poke;
 use super::source::Files;
@@ -243,8 +244,8 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         0.0
     }
 
-    /// Returns the largest measured factor by which the true error of a script may exceed that of a rehearsal.
-    fn rehearsal_margin(&self) -> f64;
+    /// Returns the largest measured factor by which the true error of a script with an integrator may exceed that of a rehearsal.
+    fn rehearsal_margin(&self, integrator: Integrator) -> f64;
 
     /// Returns the strength of a rehearsal's forces, 1 for those that move a point that is held by its own anchor by about a
     /// distance between points. Where points hold each other only, forces on many of them add up.

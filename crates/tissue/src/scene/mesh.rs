@@ -17,6 +17,7 @@ use super::springs::Springs;
 use super::volume::{Swelling, Volume};
 use crate::limits::Limits;
 use crate::memory;
+use crate::scene::Integrator;
 use crate::scene::action_check::physical;
 use crate::scene::body::{BodyKind, KindOfBody, StiffnessBound};
 use crate::scene::graph::{MeshGraph, MeshSpring};
@@ -509,7 +510,7 @@ impl BodyKind for Mesh {
 
     /// A rehearsal pushes the vertex that vibrates fastest; all others have smaller errors. (56 random meshes at 5
     /// tolerances: at most 1.4 times, half of them 0.05 times.)
-    fn rehearsal_margin(&self) -> f64 {
+    fn rehearsal_margin(&self, _: Integrator) -> f64 {
         2.0
     }
 

@@ -7,6 +7,7 @@ use glam::{DVec2, DVec3};
 
 use crate::limits::Limits;
 use crate::memory;
+use crate::scene::Integrator;
 use crate::scene::action_check::physical;
 use crate::scene::body::{BodyKind, KindOfBody};
 use crate::scene::source::Files;
@@ -230,7 +231,7 @@ impl BodyKind for Sheet {
         self.point_mass_kg * self.point_count() as f64
     }
 
-    fn rehearsal_margin(&self) -> f64 {
+    fn rehearsal_margin(&self, _: Integrator) -> f64 {
         5.0
     }
 

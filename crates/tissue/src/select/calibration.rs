@@ -209,16 +209,16 @@ impl<'s> Rehearsal<'s> {
         best.filter(|truth| truth.uncertainty <= MAX_UNCERTAINTY)
     }
 
-    /// Returns the factor by which the true error of a script may exceed the rehearsed one.
-    fn margin(&self) -> f64 {
-        self.scene.body.kind().rehearsal_margin()
+    /// Returns the factor by which the true error of a script with an integrator may exceed the rehearsed one.
+    fn margin(&self, integrator: Integrator) -> f64 {
+        self.scene.body.kind().rehearsal_margin(integrator)
     }
 
     /// Returns the smallest error that can be expected of any scheme, given the uncertainty of the reference. 0
     /// if that is within the tolerance; infinite if nothing can be estimated.
     pub(crate) fn least_error(&self) -> f64 {
         let uncertainty = |truth: &Option<Truth>| truth.as_ref().map_or(f64::INFINITY, |truth| truth.uncertainty);
-        self.margin() * self.truth.iter().map(uncertainty).fold(0.0, f64::max)
+        self.margin(self.reference) * self.truth.iter().map(uncertainty).fold(0.0, f64::max)
     }
 
     /// Returns the expected error of a scheme with `substeps` in a step of the scene and a format: the larger
@@ -235,7 +235,7 @@ impl<'s> Rehearsal<'s> {
         };
         // The first course that can't be followed is enough.
         let largest = LOADS.iter().zip(&self.truth).try_fold(0.0, |largest: f64, pair| Some(largest.max(error(pair)?)));
-        self.margin() * largest.unwrap_or(f64::INFINITY)
+        self.margin(integrator) * largest.unwrap_or(f64::INFINITY)
     }
 
     /// Returns `substeps` rounded up to whole rehearsed steps.

@@ -9,7 +9,7 @@ use std::cell::RefCell;
 
 use glam::{DMat3, DVec3};
 
-use super::neo_hookean::{NeoHookean, Patterns, Stress, invariants};
+use super::neo_hookean::{Invariants, NeoHookean, Patterns, Stress};
 use super::places::SolidPlaces;
 use crate::kernel::lanes::{self, Scalar, SingleWork};
 
@@ -47,27 +47,19 @@ pub(crate) struct LinearCells {
 /// Returns the patterns of a cube.
 #[inline(always)]
 fn patterns_of(corners: &[DVec3; 8]) -> Patterns<One> {
-    let mut patterns = Patterns::at_rest(Scalar(0.0));
-    for c in 0..3 {
-        let (mut near, mut far) = ([Scalar(0.0); 4], [Scalar(0.0); 4]);
-        for row in 0..4 {
-            near[row] = Scalar(corners[2 * row][c]);
-            far[row] = Scalar(corners[2 * row + 1][c]);
-        }
-        patterns.set(c, near, far);
-    }
-    patterns
+    Patterns::of_corners(&corners.map(|corner| corner.to_array().map(Scalar)))
 }
 
 /// Returns the force on each corner, outward: what resists the displacement that causes it.
 #[inline(always)]
-fn resisting(stress: &Stress<One>, patterns: &Patterns<One>) -> [DVec3; 8] {
+fn resisting(stress: &Stress<One>) -> [DVec3; 8] {
     let mut forces = [DVec3::ZERO; 8];
     for c in 0..3 {
-        let of = stress.on_rows(patterns, c);
-        for row in 0..4 {
-            forces[2 * row][c] = of.even[row].0 - of.odd[row].0;
-            forces[2 * row + 1][c] = of.even[row].0 + of.odd[row].0;
+        let sides = [stress.on_near_side(c, [Scalar(0.0); 4]), stress.on_far_side(c)];
+        for corner in 0..8 {
+            let signed = |bit: usize, value: f64| if corner >> bit & 1 == 1 { value } else { -value };
+            let [all, z, x, xz] = sides[corner >> 1 & 1].map(|part| part.0);
+            forces[corner][c] = all + signed(2, z) + signed(0, x + signed(2, xz));
         }
     }
     forces
@@ -133,13 +125,13 @@ impl LinearCells {
             });
             let patterns = patterns_of(&corners);
             let stress = law.stress(Scalar(cell.weight), &patterns);
-            cell.forces_n = resisting(&stress, &patterns).map(|force_n| *turn * -force_n);
+            cell.forces_n = resisting(&stress).map(|force_n| *turn * -force_n);
             let h = &patterns.h;
-            let (cofactor, trace, growth) = invariants(h);
+            let Invariants { cofactor, growth, .. } = Invariants::of(h);
             for i in 0..3 {
                 for j in 0..3 {
                     cell.h[i][j] = h[i][j].0;
-                    cell.cofactor[i][j] = cofactor[i][j].0 + if i == j { 16.0 + 4.0 * trace.0 } else { 0.0 };
+                    cell.cofactor[i][j] = cofactor[i][j].0 + if i == j { 16.0 } else { 0.0 };
                 }
             }
             cell.q = (*lame + *shear) * growth.0 / 64.0 - *shear;
@@ -180,8 +172,8 @@ impl LinearCells {
                     if point == BEYOND { DVec3::ZERO } else { back * x[point as usize][system] }
                 });
                 let patterns = patterns_of(&corners);
-                let stress = Stress::of(self.stress(cell, &patterns.h, c), Scalar(c * self.shear));
-                let forces = resisting(&stress, &patterns);
+                let stress = Stress::of(self.stress(cell, &patterns.h, c), Scalar(c * self.shear), patterns.g);
+                let forces = resisting(&stress);
                 for corner in 0..8 {
                     let point = cell.points[corner];
                     if point != BEYOND {

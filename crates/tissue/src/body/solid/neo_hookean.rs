@@ -18,9 +18,12 @@
 //!
 //! −k/64·w·[(16 P)·σ + μ/E·(8/3·(g₁σ_yσ_z + g₂σ_xσ_z + g₃σ_xσ_y) + 4/3·g₄σ_xσ_yσ_z)],
 //!
-//! w the part of the cube that is there times its factor of E. A node's force is a sum over its eight cubes, here in
-//! fours: rows along x, with A (the part without σ_x) and B (the part with it); the near corner gets A − B, the far one
-//! A + B.
+//! w the part of the cube that is there times its factor of E. Patterns and forces are computed by sides ([`CubeSide`]): the four
+//! corners with one y have sums and differences along x and z of their own, which the next cube along y shares.
+//!
+//! With h, 16(cof F − I) = e and 64(J − 1) = h₀₀·16 + (4 + h₀₀)·e₀₀ + h₀₁·e₀₁ + h₀₂·e₀₂, and so
+//!
+//! 16 P = 4μ·h + q·e + 16(q + μ)·I.
 //!
 //! **Limits.** The law stiffens as λ|cof F|², and as μ|F|. So that a substep that is stable at rest stays stable however far
 //! the tissue is pressed or pulled, W = μ(½|H|² + tr H) + ψ has in place of ψ = ½(λ + μ)(J − 1)² − μ(J − 1)
@@ -30,13 +33,16 @@
 //! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2gψ/s·(|F|²F − F·Fᵀ·F) where
 //! g < 1. (A force that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside
 //! out.) Pressed by half of its height, a block gives way as without limits.
-#![allow(clippy::needless_range_loop)]
+#![allow(unsafe_code, clippy::needless_range_loop)]
 
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
 /// |cof F|² from which on ψ is reduced; 3 at rest.
 const SOFTENS: f64 = 3.5;
+
+/// |4F|² up to which |cof F|² is below [`SOFTENS`]: 16·√(3·3.5), less a thousandth for rounding.
+const MAY_SOFTEN: f64 = 51.79;
 
 /// The largest pressure, in μ.
 const LARGEST: f64 = 5.0;
@@ -52,13 +58,16 @@ pub(crate) struct NeoHookean<T> {
     largest_growth: T,
 }
 
-/// One component of the force of a cube on the rows of its corners along x: near in y and z, far in y, far in z, far in
-/// both.
-pub(crate) struct RowForces<V> {
-    /// The mean force of both corners of a row.
-    pub(crate) even: [V; 4],
-    /// Half the difference: the corner farther along x gets even + odd, the other one even − odd.
-    pub(crate) odd: [V; 4],
+/// Sums and differences over the four corners of a cube with one y, by component: of all, with σ_z, with σ_x, and with σ_xσ_z. Of
+/// forces, a corner gets the sum of the four with its own signs.
+pub(crate) type CubeSide<V> = [[V; 4]; 3];
+
+/// Returns one component of a side, from the corners nearer and farther along x at the lower z, and at the higher.
+#[inline(always)]
+pub(crate) fn side<V: Vector>([near, far]: [V; 2], [near_above, far_above]: [V; 2]) -> [V; 4] {
+    let (sum, difference) = (far.add(near), far.sub(near));
+    let (sum_above, difference_above) = (far_above.add(near_above), far_above.sub(near_above));
+    [sum_above.add(sum), sum_above.sub(sum), difference_above.add(difference), difference_above.sub(difference)]
 }
 
 /// The patterns of a cube: h and the hourglasses g₁ to g₄, by component.
@@ -67,62 +76,128 @@ pub(crate) struct Patterns<V> {
     pub(super) g: [[V; 4]; 3],
 }
 
-/// What a cube's patterns pull with: 16 P and the factors of the first three hourglasses and of the fourth, all times the
-/// weight.
+/// What a cube pulls its corners with: 16 P and the factors of the first three hourglasses and of the fourth, all times the
+/// weight; and the hourglasses.
 pub(crate) struct Stress<V> {
     p: [[V; 3]; 3],
+    g: [[V; 4]; 3],
     hours: [V; 2],
 }
 
-/// Returns the patterns of one component, from the sums and differences along x of the four rows.
-#[inline(always)]
-fn patterns<V: Vector>([s00, s10, s01, s11]: [V; 4], [d00, d10, d01, d11]: [V; 4]) -> ([V; 3], [V; 4]) {
-    // Along y, near and far in z.
-    let (ss0, sd0, ds0, dd0) = (s10.add(s00), s10.sub(s00), d10.add(d00), d10.sub(d00));
-    let (ss1, sd1, ds1, dd1) = (s11.add(s01), s11.sub(s01), d11.add(d01), d11.sub(d01));
-    ([ds1.add(ds0), sd1.add(sd0), ss1.sub(ss0)], [sd1.sub(sd0), ds1.sub(ds0), dd1.add(dd0), dd1.sub(dd0)])
-}
-
 impl<V: Vector> Patterns<V> {
-    /// Returns the patterns of cubes at rest.
+    /// Returns the patterns of cubes between two sides, the second farther along y.
     #[inline(always)]
-    pub(crate) fn at_rest(zero: V) -> Self {
-        Patterns { h: [[zero; 3]; 3], g: [[zero; 4]; 3] }
+    pub(crate) fn between(near: &CubeSide<V>, far: &CubeSide<V>) -> Self {
+        let zero = near[0][0].splat(V::Real::default());
+        let mut patterns = Patterns { h: [[zero; 3]; 3], g: [[zero; 4]; 3] };
+        for c in 0..3 {
+            let ([all, z, x, xz], [far_all, far_z, far_x, far_xz]) = (near[c], far[c]);
+            patterns.h[c] = [far_x.add(x), far_all.sub(all), far_z.add(z)];
+            patterns.g[c] = [far_z.sub(z), far_xz.add(xz), far_x.sub(x), far_xz.sub(xz)];
+        }
+        patterns
     }
 
-    /// Sets a component, from the displacements of the corners nearer along x by row, and of those farther.
+    /// Writes the hourglasses where [`Stress::load`] reads them: as soon as they are known, because there are not registers enough to
+    /// keep them for the stress.
+    ///
+    /// # Safety
+    /// As [`Stress::store`].
     #[inline(always)]
-    pub(crate) fn set(&mut self, c: usize, near: [V; 4], far: [V; 4]) {
-        let (mut sums, mut differences) = (near, near);
-        for row in 0..4 {
-            sums[row] = far[row].add(near[row]);
-            differences[row] = far[row].sub(near[row]);
+    pub(super) unsafe fn store_hourglasses(&self, to: *mut V::Real) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            for c in 0..3 {
+                for hour in 0..4 {
+                    self.g[c][hour].store(to.add((9 + 4 * c + hour) * V::LANES));
+                }
+            }
         }
-        (self.h[c], self.g[c]) = patterns(sums, differences);
+    }
+
+    /// Returns the patterns of cubes by corner, x before y before z, and component.
+    #[inline(always)]
+    pub(crate) fn of_corners(corners: &[[V; 3]; 8]) -> Self {
+        let zero = corners[0][0].splat(V::Real::default());
+        let mut sides = [[[zero; 4]; 3]; 2];
+        for y in 0..2 {
+            for c in 0..3 {
+                let of_row = |row: usize| [corners[2 * row][c], corners[2 * row + 1][c]];
+                sides[y][c] = side(of_row(y), of_row(y + 2));
+            }
+        }
+        Self::between(&sides[0], &sides[1])
     }
 }
 
 impl<V: Vector> Stress<V> {
-    /// Creates it from 16 P and the factor μ/E, both times the weight.
+    /// Number of vectors that [`Stress::store`] writes.
+    pub(crate) const VECTORS: usize = 23;
+
+    /// Creates it from 16 P and the factor μ/E, both times the weight, and the hourglasses.
     #[inline(always)]
-    pub(super) fn of(p: [[V; 3]; 3], shear: V) -> Self {
+    pub(super) fn of(p: [[V; 3]; 3], shear: V, g: [[V; 4]; 3]) -> Self {
         let hour = |factor: f64| shear.mul(shear.splat(V::Real::of(factor)));
-        Stress { p, hours: [hour(8.0 / 3.0), hour(4.0 / 3.0)] }
+        Stress { p, g, hours: [hour(8.0 / 3.0), hour(4.0 / 3.0)] }
     }
 
-    /// Returns a component of the forces on the corners.
+    /// Writes it, but for the hourglasses, which [`Patterns::store_hourglasses`] wrote.
+    ///
+    /// # Safety
+    /// [`Stress::VECTORS`] vectors can be written at `to`.
     #[inline(always)]
-    pub(crate) fn on_rows(&self, patterns: &Patterns<V>, c: usize) -> RowForces<V> {
-        let ([px, py, pz], [g1, g2, g3, g4], [three, one]) = (self.p[c], patterns.g[c], self.hours);
-        let zero = px.splat(V::Real::default());
-        let (py_less, py_more) = (py.minus(three, g1), three.mul_add(g1, py));
-        let (px_less, px_more) = (px.minus(three, g2), three.mul_add(g2, px));
-        let third = three.mul(g3);
-        let (third_less, third_more) = (third.minus(one, g4), one.mul_add(g4, third));
-        RowForces {
-            even: [zero.sub(py_less).sub(pz), py_less.sub(pz), pz.sub(py_more), pz.add(py_more)],
-            odd: [px_less.sub(third_less), px_less.add(third_less), px_more.sub(third_more), px_more.add(third_more)],
+    pub(super) unsafe fn store(&self, to: *mut V::Real) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            for c in 0..3 {
+                for along in 0..3 {
+                    self.p[c][along].store(to.add((3 * c + along) * V::LANES));
+                }
+            }
+            self.hours[0].store(to.add(21 * V::LANES));
+            self.hours[1].store(to.add(22 * V::LANES));
         }
+    }
+
+    /// Reads what [`Stress::store`] and [`Patterns::store_hourglasses`] wrote.
+    ///
+    /// # Safety
+    /// The processor has the instructions, and the vectors can be read at `from`.
+    #[inline(always)]
+    pub(super) unsafe fn load(from: *const V::Real) -> Self {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let zero = V::of(V::Real::default());
+            let (mut p, mut g) = ([[zero; 3]; 3], [[zero; 4]; 3]);
+            for c in 0..3 {
+                for along in 0..3 {
+                    p[c][along] = V::load(from.add((3 * c + along) * V::LANES));
+                }
+                for hour in 0..4 {
+                    g[c][hour] = V::load(from.add((9 + 4 * c + hour) * V::LANES));
+                }
+            }
+            Stress { p, g, hours: [V::load(from.add(21 * V::LANES)), V::load(from.add(22 * V::LANES))] }
+        }
+    }
+
+    /// Adds a component of the force on the side nearer along y to `sum`.
+    #[inline(always)]
+    pub(crate) fn on_near_side(&self, c: usize, sum: [V; 4]) -> [V; 4] {
+        let ([px, py, pz], [g1, g2, g3, g4], [three, one]) = (self.p[c], self.g[c], self.hours);
+        [
+            sum[0].sub(py),
+            sum[1].add(pz.minus(three, g1)),
+            sum[2].add(px.minus(three, g3)),
+            sum[3].add(three.mul(g2).minus(one, g4)),
+        ]
+    }
+
+    /// Returns a component of the force on the side farther along y.
+    #[inline(always)]
+    pub(crate) fn on_far_side(&self, c: usize) -> [V; 4] {
+        let ([px, py, pz], [g1, g2, g3, g4], [three, one]) = (self.p[c], self.g[c], self.hours);
+        [py, three.mul_add(g1, pz), three.mul_add(g3, px), one.mul_add(g4, three.mul(g2))]
     }
 }
 
@@ -141,10 +216,8 @@ impl<T: Real> NeoHookean<T> {
     /// Returns 64(J − 1) as far as the pressure grows with it.
     #[inline(always)]
     fn growing<V: Vector<Real = T>>(&self, growth: V) -> V {
-        let (largest, zero) = (growth.splat(self.largest_growth), growth.splat(T::default()));
-        let least = zero.sub(largest);
-        // The smaller of two is minus the larger of both turned round.
-        zero.sub(zero.sub(growth).larger(least)).larger(least)
+        let largest = growth.splat(self.largest_growth);
+        growth.smaller(largest).larger(growth.splat(T::default()).sub(largest))
     }
 
     /// Returns 64 ψ without g, with c in it; `pressure` is 16 times the pressure for `growing`.
@@ -157,38 +230,36 @@ impl<T: Real> NeoHookean<T> {
 
     /// Returns what cubes of weight `w` pull with.
     #[inline(always)]
-    pub(crate) fn stress<V: Vector<Real = T>>(&self, w: V, Patterns { h, .. }: &Patterns<V>) -> Stress<V> {
+    pub(crate) fn stress<V: Vector<Real = T>>(&self, w: V, Patterns { h, g }: &Patterns<V>) -> Stress<V> {
         let shear = w.mul(w.splat(self.shear));
         let bulk = w.mul(w.splat(self.bulk));
-        let (cofactor, trace, growth) = invariants(h);
+        let Invariants { diagonal, cofactor, growth } = Invariants::of(h);
         let growing = self.growing(growth);
-        let (mut pressure, sixteenth, four) = (bulk.mul(growing), w.splat(T::of(0.0625)), w.splat(T::of(4.0)));
-        let mut q = pressure.mul(sixteenth).sub(shear);
-        let (squares, most) = (squares(&cofactor, trace), w.splat(T::of(256.0 * SOFTENS)));
-        let is_far = squares.above(most);
+        let mut pressure = bulk.mul(growing);
+        let mut q = bulk.mul(w.splat(T::of(0.0625))).mul(growing).sub(shear);
         let mut far = None;
-        if V::any(is_far) {
+        if V::any(may_soften(h, diagonal)) {
+            let (squares, most) = (squares(&cofactor), w.splat(T::of(256.0 * SOFTENS)));
+            let is_far = squares.above(most);
             let psi = Self::psi(growth, growing, pressure, shear);
             let part = most.div(squares.larger(most));
             let sixteen = w.splat(T::of(16.0));
             q = V::select(is_far, q.mul(part), q);
             pressure = V::select(is_far, sixteen.mul(q.add(shear)), pressure);
-            far = Some(part.mul(psi).mul(w.splat(T::of(-2.0))).div(squares));
+            far = Some((is_far, part.mul(psi).mul(w.splat(T::of(-2.0))).div(squares)));
         }
-        // 16 P, all times the weight: 4μ·h + q·(cof h − 4hᵀ) + (16 (q + μ) + 4 q·tr h)·I, where q is g·ψ′ and `pressure`
-        // 16 (q + μ).
-        let (shear_four, q_four) = (shear.mul(four), q.mul(four));
-        let spherical = q_four.mul_add(trace, pressure);
+        // 16 P, all times the weight: 4μ·h + q·e + 16(q + μ)·I, where q is g·ψ′ and `pressure` 16(q + μ).
+        let shear_four = shear.mul(w.splat(T::of(4.0)));
         let mut p = [[w; 3]; 3];
         for c in 0..3 {
             for along in 0..3 {
-                let own =
-                    if c == along { shear_four.mul_add(h[c][along], spherical) } else { shear_four.mul(h[c][along]) };
+                let h = h[c][along];
+                let own = if c == along { shear_four.mul_add(h, pressure) } else { shear_four.mul(h) };
                 p[c][along] = q.mul_add(cofactor[c][along], own);
             }
         }
-        if let Some(factor) = far {
-            let slope = half_slope_of_squares(h);
+        if let Some((is_far, factor)) = far {
+            let slope = half_slope_of_squares(h, diagonal);
             for c in 0..3 {
                 for along in 0..3 {
                     let more = factor.mul_add(slope[c][along], p[c][along]);
@@ -196,7 +267,7 @@ impl<T: Real> NeoHookean<T> {
                 }
             }
         }
-        Stress::of(p, shear)
+        Stress::of(p, shear, *g)
     }
 
     /// Returns the energy of cubes, in the scheme's units of force times edges.
@@ -204,7 +275,8 @@ impl<T: Real> NeoHookean<T> {
     pub(crate) fn energy<V: Vector<Real = T>>(&self, w: V, Patterns { h, g }: &Patterns<V>) -> V {
         let shear = w.mul(w.splat(self.shear));
         let bulk = w.mul(w.splat(self.bulk));
-        let (cofactor, trace, growth) = invariants(h);
+        let Invariants { cofactor, growth, .. } = Invariants::of(h);
+        let trace = h[0][0].add(h[1][1]).add(h[2][2]);
         let zero = w.splat(T::default());
         let (mut of_squares, mut hours, mut last) = (zero, zero, zero);
         for c in 0..3 {
@@ -223,47 +295,71 @@ impl<T: Real> NeoHookean<T> {
         // ψ + μ(J − 1), without the difference of large numbers at small h; then (g − 1)·ψ.
         let swelling = pressure.mul(w.splat(T::of(0.0625))).mul(growth.minus(w.splat(T::of(0.5)), growing));
         let most = w.splat(T::of(256.0 * SOFTENS));
-        let less = most.div(squares(&cofactor, trace).larger(most)).sub(w.splat(T::of(1.0)));
+        let less = most.div(squares(&cofactor).larger(most)).sub(w.splat(T::of(1.0)));
         let reduced = less.mul(Self::psi(growth, growing, pressure, shear));
         shear.mul_add(of_h.add(of_g), swelling.add(reduced))
     }
 }
 
-/// Returns cof h − 4hᵀ (16 times cof F less its diagonal part), tr h, and 64(J − 1).
-#[inline(always)]
-pub(super) fn invariants<V: Vector>(h: &[[V; 3]; 3]) -> ([[V; 3]; 3], V, V) {
-    let zero = h[0][0].splat(V::Real::default());
-    let (four, sixteen) = (zero.splat(V::Real::of(4.0)), zero.splat(V::Real::of(16.0)));
-    let mut cofactor = [[zero; 3]; 3];
-    for i in 0..3 {
-        let (i1, i2) = ((i + 1) % 3, (i + 2) % 3);
-        for j in 0..3 {
-            let (j1, j2) = ((j + 1) % 3, (j + 2) % 3);
-            cofactor[i][j] = h[i1][j1].mul(h[i2][j2]).minus(h[i1][j2], h[i2][j1]);
-        }
-    }
-    let trace = h[0][0].add(h[1][1]).add(h[2][2]);
-    let of_cofactor = cofactor[0][0].add(cofactor[1][1]).add(cofactor[2][2]);
-    let determinant = h[0][2].mul_add(cofactor[0][2], h[0][1].mul_add(cofactor[0][1], h[0][0].mul(cofactor[0][0])));
-    let growth = sixteen.mul_add(trace, four.mul_add(of_cofactor, determinant));
-    for i in 0..3 {
-        for j in 0..3 {
-            cofactor[i][j] = cofactor[i][j].minus(four, h[j][i]);
-        }
-    }
-    (cofactor, trace, growth)
+/// What the law needs of h.
+pub(super) struct Invariants<V> {
+    /// The diagonal of 4F.
+    diagonal: [V; 3],
+    /// e = 16(cof F − I).
+    pub(super) cofactor: [[V; 3]; 3],
+    /// 64(J − 1).
+    pub(super) growth: V,
 }
 
-/// Returns 256|cof F|². `cofactor` and `trace` are those of [`invariants`].
+impl<V: Vector> Invariants<V> {
+    /// Computes them without a difference of large numbers at small h.
+    #[inline(always)]
+    pub(super) fn of(h: &[[V; 3]; 3]) -> Self {
+        let zero = h[0][0].splat(V::Real::default());
+        let four = zero.splat(V::Real::of(4.0));
+        let diagonal = [h[0][0].add(four), h[1][1].add(four), h[2][2].add(four)];
+        // An entry of 4F.
+        let a = |i: usize, j: usize| if i == j { diagonal[i] } else { h[i][j] };
+        let mut cofactor = [[zero; 3]; 3];
+        for i in 0..3 {
+            let (i1, i2) = ((i + 1) % 3, (i + 2) % 3);
+            for j in 0..3 {
+                let (j1, j2) = ((j + 1) % 3, (j + 2) % 3);
+                cofactor[i][j] = if i == j {
+                    let own = h[i1][i1].mul(h[i2][i2]).minus(h[i1][i2], h[i2][i1]);
+                    four.mul_add(h[i1][i1].add(h[i2][i2]), own)
+                } else {
+                    a(i1, j1).mul(a(i2, j2)).minus(a(i1, j2), a(i2, j1))
+                };
+            }
+        }
+        let sixteen = zero.splat(V::Real::of(16.0));
+        let apart = h[0][2].mul_add(cofactor[0][2], h[0][1].mul_add(cofactor[0][1], sixteen.mul(h[0][0])));
+        Invariants { diagonal, cofactor, growth: diagonal[0].mul_add(cofactor[0][0], apart) }
+    }
+}
+
+/// Returns the lanes where |cof F|² may be beyond [`SOFTENS`]: it is at most |F|⁴/3. Tissue that is only touched has none, and this
+/// takes no cofactor; so its sums may have any order.
 #[inline(always)]
-fn squares<V: Vector>(cofactor: &[[V; 3]; 3], trace: V) -> V {
-    let of = |value: f64| trace.splat(V::Real::of(value));
-    // 16 cof F = 16 + 4 tr h on the diagonal, and the rest.
-    let diagonal = of(4.0).mul_add(trace, of(16.0));
-    let mut squares = of(0.0);
+fn may_soften<V: Vector>(h: &[[V; 3]; 3], diagonal: [V; 3]) -> V::Mask {
+    let of_row = |a: V, b: V, c: V| c.mul_add(c, b.mul_add(b, a.mul(a)));
+    let [first, second, third] = [
+        of_row(diagonal[0], h[0][1], h[0][2]),
+        of_row(h[1][0], diagonal[1], h[1][2]),
+        of_row(h[2][0], h[2][1], diagonal[2]),
+    ];
+    first.add(second).add(third).above(first.splat(V::Real::of(MAY_SOFTEN)))
+}
+
+/// Returns 256|cof F|², from e.
+#[inline(always)]
+fn squares<V: Vector>(cofactor: &[[V; 3]; 3]) -> V {
+    let sixteen = cofactor[0][0].splat(V::Real::of(16.0));
+    let mut squares = cofactor[0][0].splat(V::Real::default());
     for i in 0..3 {
         for j in 0..3 {
-            let value = if i == j { cofactor[i][j].add(diagonal) } else { cofactor[i][j] };
+            let value = if i == j { cofactor[i][j].add(sixteen) } else { cofactor[i][j] };
             squares = value.mul_add(value, squares);
         }
     }
@@ -272,11 +368,11 @@ fn squares<V: Vector>(cofactor: &[[V; 3]; 3], trace: V) -> V {
 
 /// Returns |A|²A − A·Aᵀ·A of A = 4F = 4 + h: half the derivative of |cof A|².
 #[inline(always)]
-fn half_slope_of_squares<V: Vector>(h: &[[V; 3]; 3]) -> [[V; 3]; 3] {
-    let (zero, four) = (h[0][0].splat(V::Real::default()), h[0][0].splat(V::Real::of(4.0)));
+fn half_slope_of_squares<V: Vector>(h: &[[V; 3]; 3], diagonal: [V; 3]) -> [[V; 3]; 3] {
+    let zero = h[0][0].splat(V::Real::default());
     let mut a = *h;
     for c in 0..3 {
-        a[c][c] = h[c][c].add(four);
+        a[c][c] = diagonal[c];
     }
     let mut products = [[zero; 3]; 3];
     for i in 0..3 {

@@ -1,11 +1,15 @@
 //! The sweep over a lattice: evaluates every cube once, row by row, and advances the corners behind it, in place.
 //!
-//! Row (j, k) of cubes acts on the rows (j, k), (j + 1, k), (j, k + 1) and (j + 1, k + 1) of corners. What the sweep still
-//! needs of it waits: for (j + 1, k) in a row, for (j, k + 1) in a plane, for (j + 1, k + 1) in a row that the next row of
-//! cubes adds to the plane. When cube row (j, k) is done, all forces on corner row (j, k) are known and nothing reads its
-//! displacements again. All of it is kept as even and odd parts along x ([`neo_hookean`](super::neo_hookean)): the force on corner i is
+//! Row (j, k) of cubes acts on the rows (j, k), (j + 1, k), (j, k + 1) and (j + 1, k + 1) of corners. Forces are kept by
+//! sides ([`neo_hookean::CubeSide`](super::neo_hookean::CubeSide)), the corners with one y: with the signs of a lower z they act on row
+//! (j, k), with those of a higher one on (j, k + 1). What the sweep still needs waits: the far side of a row of cubes for the next
+//! row, and for each row of a plane, even and odd along x, what comes from the plane before. When cube row (j, k) is done, all forces
+//! on corner row (j, k) are known, and nothing reads its displacements again. The force on corner i is
 //!
-//! (odd − even) of cube i − (even + odd) of cube i − 1,  each the sum (plane + row) + own.
+//! (odd − even) of cube i − (even + odd) of cube i − 1,  each the part of the plane before + (side, all ∓ with σ_z).
+//!
+//! A row is three loops: over what each cube pulls with, over the sums of forces, and over the corners that advance. Each is short
+//! enough for a processor to work on several blocks at once; one loop was not, and took half as long again.
 //!
 //! A lane's result depends on the same operations in the same order at every width. Blocks of eight columns without a
 //! cube are skipped; a cube of weight 0 has a force of 0, so this changes no bit either.
@@ -19,7 +23,7 @@ use std::ops::Range;
 
 use glam::DVec3;
 
-use super::neo_hookean::{NeoHookean, Patterns};
+use super::neo_hookean::{NeoHookean, Patterns, Stress, side};
 use super::places::SolidPlaces;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::{Run, Scalar, Vector};
@@ -82,8 +86,49 @@ pub(crate) struct SolidTables<T> {
     groups: Vec<u8>,
     /// The columns of each row that have corners or act on some, in whole blocks.
     spans: Vec<Range<usize>>,
-    waiting: RefCell<Field<T>>,
+    buffers: RefCell<Buffers<T>>,
 }
+
+/// What a sweep keeps for a while, block by block, so that the values of a block lie together and few addresses are computed.
+#[derive(Debug)]
+struct Buffers<T> {
+    /// For each row of a plane, even and odd parts along x of the forces by the plane before; by component.
+    planes: Field<T>,
+    /// The forces on the far side of the row of cubes before.
+    far_side: Field<T>,
+    /// The displacements of the far side of the row of cubes before, and the row of corners they are those of.
+    shared: Field<T>,
+    shared_rows: Vec<usize>,
+    /// What the cubes of a row pull with ([`Stress`]); then, in its place, the forces on the corners.
+    stresses: Field<T>,
+}
+
+impl<T: Real> Buffers<T> {
+    fn new(places: &SolidPlaces, layout: &Layout) -> Self {
+        let of = |values: usize| Field::of_length(values * layout.stride + BLOCK);
+        Buffers {
+            planes: of(PLANE_VALUES * places.rows_per_plane()),
+            far_side: of(SIDE_VALUES),
+            shared: of(SIDE_VALUES),
+            shared_rows: vec![usize::MAX; layout.stride],
+            stresses: of(STRESS_VALUES),
+        }
+    }
+
+    /// Makes them ready for a sweep: nothing acts yet, and nothing is known.
+    fn clear(&mut self) {
+        self.planes.fill(T::default());
+        self.far_side.fill(T::default());
+        self.shared_rows.fill(usize::MAX);
+    }
+}
+
+/// Values of a cube's stress.
+const STRESS_VALUES: usize = Stress::<Scalar<f64>>::VECTORS;
+
+/// Values of a side, and what waits for a corner of a plane.
+const SIDE_VALUES: usize = 12;
+const PLANE_VALUES: usize = 6;
 
 impl<T: Real> SolidTables<T> {
     /// Creates the tables of a lattice.
@@ -95,7 +140,7 @@ impl<T: Real> SolidTables<T> {
             beds: Field::of_length(layout.plane),
             groups: vec![0; layout.plane.div_ceil(GROUP)],
             spans: vec![0..0; layout.rows],
-            waiting: RefCell::new(Field::of_length(6 * (places.rows_per_plane() + 2) * layout.stride + BLOCK)),
+            buffers: RefCell::new(Buffers::new(places, layout)),
         };
         let mut reached = vec![[usize::MAX, 0]; layout.rows];
         for place in 0..places.count() {
@@ -147,18 +192,22 @@ impl<T: Real, S: Stage<T>> Run<T> for SolidSweep<'_, T, S> {
     unsafe fn run<V: Vector<Real = T>>(&self) {
         let SolidGrid { layout, places, tables, .. } = &self.grid;
         let rows = places.rows_per_plane();
-        let mut waiting = tables.waiting.borrow_mut();
-        assert!(waiting.len() == 6 * (rows + 2) * layout.stride + BLOCK && tables.weights.len() == layout.plane);
-        waiting.fill(T::default());
-        let waiting = waiting.as_mut_ptr();
+        let mut buffers = tables.buffers.borrow_mut();
+        assert!(buffers.planes.len() == PLANE_VALUES * rows * layout.stride + BLOCK);
+        assert!(
+            buffers.stresses.len() == STRESS_VALUES * layout.stride + BLOCK && tables.weights.len() == layout.plane
+        );
+        buffers.clear();
         let all_awake = self.over.awake.is_full();
         // SAFETY: the caller's promise, and the tables are those of the layout.
         unsafe {
             let mut sums = self.stage.begin::<V>();
             for row in self.over.rows(rows + 1, layout.rows) {
                 // `black_box` hides the row from the compiler, which would otherwise keep an address for each array.
-                let (j, k) = (std::hint::black_box(row % rows), row / rows);
-                self.row::<V>(j, k, waiting, all_awake, &mut sums);
+                let place = [std::hint::black_box(row % rows), row / rows];
+                self.compute_stresses::<V>(place, &mut buffers, all_awake);
+                self.add_up::<V>(place, &mut buffers, all_awake);
+                self.hand_over::<V>(place, &buffers, all_awake, &mut sums);
                 self.stage.end_row();
             }
             self.stage.end(sums);
@@ -177,116 +226,185 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
         of_cubes.iter().any(|row| columns.iter().any(|column| is_awake(*row, *column)))
     }
 
-    /// Sweeps over row (j, k).
+    /// Returns what the block of a row at a column has; `None` if it is not needed. A force that waits for a sleeping corner is
+    /// never used, so it need not be right.
+    #[inline(always)]
+    fn content<V: Vector<Real = T>>(&self, row: usize, column: usize, all_awake: bool) -> Option<u8> {
+        if !all_awake && !self.is_needed(row, [column, column + V::LANES]) {
+            return None;
+        }
+        let (groups, at) = (&self.grid.tables.groups, (row * self.grid.layout.stride + column) / GROUP);
+        // SAFETY: a column of a row is in the plane, in whole blocks.
+        let group = |at: usize| unsafe { *groups.get_unchecked(at) };
+        Some(if V::LANES > GROUP { group(at).max(group(at + 1)) } else { group(at) })
+    }
+
+    /// Computes the stresses of row (j, k) of cubes.
     ///
     /// # Safety
-    /// `x` has the layout's planes; `waiting` has 6 rows for each row of a plane and two more.
+    /// `x` has the layout's planes, and the buffers are those of the layout.
     #[inline(always)]
-    unsafe fn row<V: Vector<Real = T>>(&self, j: usize, k: usize, waiting: *mut T, all_awake: bool, sums: &mut [V; 2]) {
-        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, law, load, x } = self.grid;
+    unsafe fn compute_stresses<V: Vector<Real = T>>(
+        &self,
+        [j, k]: [usize; 2],
+        buffers: &mut Buffers<T>,
+        all_awake: bool,
+    ) {
+        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, law, x, .. } = self.grid;
         let rows = places.rows_per_plane();
         let (row, layer) = (k * rows + j, stride * rows);
-        let at_row = row * stride;
+        let (stresses, shared) = (buffers.stresses.as_mut_ptr(), buffers.shared.as_mut_ptr());
         // SAFETY: the caller's promise.
         unsafe {
             let zero = V::of(T::default());
-            let of_plane = waiting.add(6 * j * stride);
-            let (of_row, of_corner) = (waiting.add(6 * rows * stride), waiting.add(6 * (rows + 1) * stride));
+            let span = tables.spans[row].clone();
+            let mut column = span.start;
+            while column < span.end {
+                if self.content::<V>(row, column, all_awake) == Some(CUBES) {
+                    let at = row * stride + column;
+                    let (mut near, mut far) = ([[zero; 4]; 3], [[zero; 4]; 3]);
+                    let of_block = shared.add(SIDE_VALUES * column);
+                    let is_known = *buffers.shared_rows.get_unchecked(column) == row;
+                    let side_at = |from: *const T| {
+                        let corners = |from: *const T| [V::load(from), V::load(from.add(1))];
+                        side(corners(from), corners(from.add(layer)))
+                    };
+                    for c in 0..3 {
+                        let of_component = of_block.add(4 * c * V::LANES);
+                        let from = x.add(c * plane + at);
+                        if is_known {
+                            for part in 0..4 {
+                                near[c][part] = V::load(of_component.add(part * V::LANES));
+                            }
+                        } else {
+                            near[c] = side_at(from);
+                        }
+                        far[c] = side_at(from.add(stride));
+                        for part in 0..4 {
+                            far[c][part].store(of_component.add(part * V::LANES));
+                        }
+                    }
+                    *buffers.shared_rows.get_unchecked_mut(column) = row + 1;
+                    let (w, patterns) = (V::load(tables.weights.as_ptr().add(at)), Patterns::between(&near, &far));
+                    let stresses = stresses.add(STRESS_VALUES * column);
+                    patterns.store_hourglasses(stresses);
+                    // The energy of a cube belongs to its least corner.
+                    if S::ENERGY && (all_awake || self.over.is_awake(row, column)) {
+                        self.stage.energy(column, law.energy(w, &patterns));
+                    }
+                    law.stress(w, &patterns).store(stresses);
+                }
+                column += V::LANES;
+            }
+        }
+    }
+
+    /// Adds up the forces on row (j, k) of corners, and writes them in place of the stresses.
+    ///
+    /// # Safety
+    /// The buffers are those of the layout, with the stresses of the row.
+    #[inline(always)]
+    unsafe fn add_up<V: Vector<Real = T>>(&self, [j, k]: [usize; 2], buffers: &mut Buffers<T>, all_awake: bool) {
+        let SolidGrid { layout: Layout { stride, .. }, places, tables, .. } = self.grid;
+        let row = k * places.rows_per_plane() + j;
+        let (planes, far_side) = (buffers.planes.as_mut_ptr(), buffers.far_side.as_mut_ptr());
+        let stresses = buffers.stresses.as_mut_ptr();
+        // SAFETY: the caller's promise.
+        unsafe {
+            let zero = V::of(T::default());
             let mut before = [zero; 3];
             let span = tables.spans[row].clone();
             let mut column = span.start;
             while column < span.end {
-                let is_awake = all_awake || self.over.is_awake(row, column);
-                // A force that waits for a sleeping corner is never used, so it need not be right.
-                if !all_awake && !self.is_needed(row, [column, column + V::LANES]) {
+                let Some(group) = self.content::<V>(row, column, all_awake) else {
                     before = [zero; 3];
                     column += V::LANES;
                     continue;
-                }
-                let at = at_row + column;
-                let group = *tables.groups.get_unchecked(at / GROUP);
-                let group =
-                    if V::LANES > GROUP { group.max(*tables.groups.get_unchecked(at / GROUP + 1)) } else { group };
-                let (mut even, mut odd) = ([zero; 3], [zero; 3]);
+                };
+                let of_plane = planes.add(PLANE_VALUES * (j * stride + column));
+                let (of_side, of_block) = (far_side.add(SIDE_VALUES * column), stresses.add(STRESS_VALUES * column));
+                let mut on_side = [[zero; 4]; 3];
                 for c in 0..3 {
-                    let place = 2 * c * stride + column;
-                    even[c] = V::load(of_plane.add(place)).add(V::load(of_row.add(place)));
-                    odd[c] = V::load(of_plane.add(place + stride)).add(V::load(of_row.add(place + stride)));
+                    for part in 0..4 {
+                        on_side[c][part] = V::load(of_side.add((4 * c + part) * V::LANES));
+                    }
                 }
                 if group == CUBES {
-                    let w = V::load(tables.weights.as_ptr().add(at));
-                    let mut patterns = Patterns::at_rest(zero);
+                    let stress = Stress::<V>::load(of_block);
                     for c in 0..3 {
-                        let from = x.add(c * plane + at);
-                        let (up, beyond) = (from.add(layer), from.add(1));
-                        let far_up = up.add(1);
-                        patterns.set(
-                            c,
-                            [V::load(from), V::load(from.add(stride)), V::load(up), V::load(up.add(stride))],
-                            [
-                                V::load(beyond),
-                                V::load(beyond.add(stride)),
-                                V::load(far_up),
-                                V::load(far_up.add(stride)),
-                            ],
-                        );
-                    }
-                    // The energy of a cube belongs to its least corner.
-                    if S::ENERGY && is_awake {
-                        self.stage.energy(column, law.energy(w, &patterns));
-                    }
-                    let stress = law.stress(w, &patterns);
-                    for c in 0..3 {
-                        let forces = stress.on_rows(&patterns, c);
-                        even[c] = even[c].add(forces.even[0]);
-                        odd[c] = odd[c].add(forces.odd[0]);
-                        let place = 2 * c * stride + column;
-                        let corner = of_corner.add(place);
-                        forces.even[2].add(V::load(corner)).store(of_plane.add(place));
-                        forces.even[3].store(corner);
-                        forces.even[1].store(of_row.add(place));
-                        let (place, corner) = (place + stride, corner.add(stride));
-                        forces.odd[2].add(V::load(corner)).store(of_plane.add(place));
-                        forces.odd[3].store(corner);
-                        forces.odd[1].store(of_row.add(place));
+                        on_side[c] = stress.on_near_side(c, on_side[c]);
+                        let on_far_side = stress.on_far_side(c);
+                        for part in 0..4 {
+                            on_far_side[part].store(of_side.add((4 * c + part) * V::LANES));
+                        }
                     }
                 } else {
-                    for part in 0..6 {
-                        let place = part * stride + column;
-                        V::load(of_corner.add(place)).store(of_plane.add(place));
-                        zero.store(of_row.add(place));
-                        zero.store(of_corner.add(place));
+                    for part in 0..SIDE_VALUES {
+                        zero.store(of_side.add(part * V::LANES));
                     }
+                }
+                for c in 0..3 {
+                    let [all, z, x, xz] = on_side[c];
+                    let (of_even, of_odd) = (of_plane.add(2 * c * V::LANES), of_plane.add((2 * c + 1) * V::LANES));
+                    let (even, odd) = (V::load(of_even).add(all.sub(z)), V::load(of_odd).add(x.sub(xz)));
+                    all.add(z).store(of_even);
+                    x.add(xz).store(of_odd);
+                    let passed = even.add(odd);
+                    odd.sub(even).sub(passed.shift(before[c])).store(of_block.add(c * V::LANES));
+                    before[c] = passed;
                 }
                 if group == 0 {
                     before = [zero; 3];
-                    column += V::LANES;
-                    continue;
                 }
-                let mobility = V::load(tables.mobility.as_ptr().add(at));
-                let (mut here, mut n) = ([zero; 3], [zero; 3]);
-                for c in 0..3 {
-                    let passed = even[c].add(odd[c]);
-                    n[c] = odd[c].sub(even[c]).sub(passed.shift(before[c])).mul(mobility);
-                    before[c] = passed;
-                    here[c] = V::load(x.add(c * plane + at));
-                }
-                if load.acts {
-                    let bed = V::load(tables.beds.as_ptr().add(at));
-                    // Where there is no point, nothing has a weight.
-                    let is_point = mobility.above(zero);
-                    let mut energy = zero;
+                column += V::LANES;
+            }
+        }
+    }
+
+    /// Hands row (j, k) of corners to the stage, with the forces that [`SolidSweep::add_up`] wrote.
+    ///
+    /// # Safety
+    /// `x` has the layout's planes, and the buffers have the forces of the row.
+    #[inline(always)]
+    unsafe fn hand_over<V: Vector<Real = T>>(
+        &self,
+        [j, k]: [usize; 2],
+        buffers: &Buffers<T>,
+        all_awake: bool,
+        sums: &mut [V; 2],
+    ) {
+        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, load, x, .. } = self.grid;
+        let (row, forces) = (k * places.rows_per_plane() + j, buffers.stresses.as_ptr());
+        // SAFETY: the caller's promise.
+        unsafe {
+            let zero = V::of(T::default());
+            let span = tables.spans[row].clone();
+            let mut column = span.start;
+            while column < span.end {
+                let is_awake = all_awake || self.over.is_awake(row, column);
+                if is_awake && self.content::<V>(row, column, all_awake).is_some_and(|group| group != 0) {
+                    let at = row * stride + column;
+                    let mobility = V::load(tables.mobility.as_ptr().add(at));
+                    let (mut here, mut n) = ([zero; 3], [zero; 3]);
                     for c in 0..3 {
-                        n[c] = n[c].add(V::select(is_point, load.force(c, bed, here[c]), zero));
+                        n[c] = V::load(forces.add(STRESS_VALUES * column + c * V::LANES)).mul(mobility);
+                        here[c] = V::load(x.add(c * plane + at));
+                    }
+                    if load.acts {
+                        let bed = V::load(tables.beds.as_ptr().add(at));
+                        // Where there is no point, nothing has a weight.
+                        let is_point = mobility.above(zero);
+                        let mut energy = zero;
+                        for c in 0..3 {
+                            n[c] = n[c].add(V::select(is_point, load.force(c, bed, here[c]), zero));
+                            if S::ENERGY {
+                                energy = energy.add(load.energy(c, bed, here[c]));
+                            }
+                        }
                         if S::ENERGY {
-                            energy = energy.add(load.energy(c, bed, here[c]));
+                            self.stage.energy(column, energy.mul(V::load(tables.masses.as_ptr().add(at))));
                         }
                     }
-                    if S::ENERGY && is_awake {
-                        self.stage.energy(column, energy.mul(V::load(tables.masses.as_ptr().add(at))));
-                    }
-                }
-                if is_awake {
                     self.stage.finish::<V, ANY>(row, at, here, n, sums);
                 }
                 column += V::LANES;
@@ -306,47 +424,34 @@ pub(crate) fn gather<T: Real>(
     place: usize,
 ) -> [T; 3] {
     let zero = Scalar(T::default());
-    // Even and odd parts of the rows (j, k), (j − 1, k), (j, k − 1) and (j − 1, k − 1) of cubes, on the row of the place;
-    // first those of the cubes at the place, then those of the cubes before them along x.
-    let mut parts = [[[[zero; 4]; 3]; 2]; 2];
+    // The forces on the side of the place: by the cubes at it and by those before along x; with the same z, and before along z.
+    let mut sides = [[[[zero; 4]; 3]; 2]; 2];
     for beside in 0..2 {
-        let cubes = places.cubes_around(place, beside);
-        for row in 0..4 {
-            let Some(cube) = cubes[row] else { continue };
-            let corners = places.corners_of(cube);
-            let mut offsets = [0; 8];
-            for corner in 0..8 {
-                offsets[corner] = layout.offset(corners[corner]);
-            }
-            let mut patterns = Patterns::at_rest(zero);
+        let stress = places.cubes_around(place, beside).map(|cube| {
+            cube.map(|cube| {
+                let corners = places.corners_of(cube).map(|corner| layout.offset(corner));
+                let patterns =
+                    Patterns::of_corners(&corners.map(|at| [0, 1, 2].map(|c| Scalar(u[c * layout.plane + at]))));
+                law.stress(Scalar(T::of(places.weight(cube))), &patterns)
+            })
+        });
+        for below in 0..2 {
             for c in 0..3 {
-                let (mut near, mut far) = ([zero; 4], [zero; 4]);
-                for of_cube in 0..4 {
-                    near[of_cube] = Scalar(u[c * layout.plane + offsets[2 * of_cube]]);
-                    far[of_cube] = Scalar(u[c * layout.plane + offsets[2 * of_cube + 1]]);
-                }
-                patterns.set(c, near, far);
-            }
-            let stress = law.stress(Scalar(T::of(places.weight(cube))), &patterns);
-            for c in 0..3 {
-                let forces = stress.on_rows(&patterns, c);
-                parts[beside][0][c][row] = forces.even[row];
-                parts[beside][1][c][row] = forces.odd[row];
+                // In the order of the sweep: the far side of the row before, then the near side.
+                let far = stress[2 * below + 1].as_ref().map_or([zero; 4], |stress| stress.on_far_side(c));
+                let near = stress[2 * below].as_ref();
+                sides[beside][below][c] = near.map_or(far, |stress| stress.on_near_side(c, far));
             }
         }
     }
     let mobility = if places.mass(place) > 0.0 { Scalar(T::of(places.mass(place).recip())) } else { zero };
     let mut found = [T::default(); 3];
     for c in 0..3 {
-        // In the order of the sweep: of the plane before, of the row before, own.
-        let mut sums = [[zero; 2]; 2];
-        for beside in 0..2 {
-            for part in 0..2 {
-                let rows = parts[beside][part][c];
-                sums[beside][part] = rows[2].add(rows[3]).add(rows[1]).add(rows[0]);
-            }
-        }
-        let [[even, odd], [even_before, odd_before]] = sums;
+        let [[even, odd], [even_before, odd_before]] = [0, 1].map(|beside| {
+            let [[all, z, x, xz], [all_below, z_below, x_below, xz_below]] =
+                [0, 1].map(|below| sides[beside][below][c]);
+            [all_below.add(z_below).add(all.sub(z)), x_below.add(xz_below).add(x.sub(xz))]
+        });
         let mut force = odd.sub(even).sub(even_before.add(odd_before)).mul(mobility);
         if load.acts && places.mass(place) > 0.0 {
             let x = Scalar(u[c * layout.plane + layout.offset(place)]);

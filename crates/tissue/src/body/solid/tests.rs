@@ -27,23 +27,19 @@ const LAME: f64 = 2.1;
 type Corners = [DVec3; 8];
 
 fn patterns(corners: &Corners) -> Patterns<Scalar<f64>> {
-    let mut patterns = Patterns::at_rest(Scalar(0.0));
-    for c in 0..3 {
-        let [near, far] = [0, 1].map(|far| [0, 1, 2, 3].map(|row| Scalar(corners[2 * row + far][c])));
-        patterns.set(c, near, far);
-    }
-    patterns
+    Patterns::of_corners(&corners.map(|corner| corner.to_array().map(Scalar)))
 }
 
 fn forces(corners: &Corners) -> Corners {
-    let patterns = patterns(corners);
-    let stress = NeoHookean::new(1.0, SHEAR, LAME).stress(Scalar(0.7), &patterns);
-    let found = [0, 1, 2].map(|c| stress.on_rows(&patterns, c));
+    let stress = NeoHookean::new(1.0, SHEAR, LAME).stress(Scalar(0.7), &patterns(corners));
+    let found = [0, 1, 2]
+        .map(|c| [stress.on_near_side(c, [Scalar(0.0); 4]), stress.on_far_side(c)].map(|side| side.map(|of| of.0)));
     std::array::from_fn(|corner| {
+        let [x, y, z] = [0, 1, 2].map(|bit| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 });
         let of = |c: usize| {
-            let (even, odd) = (found[c].even[corner / 2].0, found[c].odd[corner / 2].0);
+            let [all, of_z, of_x, of_xz] = found[c][usize::from(y > 0.0)];
             // What the corner pulls with; the tissue pulls the other way.
-            -if corner % 2 == 1 { even + odd } else { even - odd }
+            -(all + z * of_z + x * of_x + x * z * of_xz)
         };
         DVec3::new(of(0), of(1), of(2))
     })

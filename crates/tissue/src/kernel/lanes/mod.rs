@@ -60,6 +60,8 @@ pub(crate) trait Vector: Copy {
     fn count(self, first: usize) -> Self;
     /// Returns the larger value; `other` if one is NaN.
     fn larger(self, other: Self) -> Self;
+    /// Returns the smaller value; `other` if one is NaN.
+    fn smaller(self, other: Self) -> Self;
     /// Returns the value of larger magnitude; either if one is NaN.
     fn farther(self, other: Self) -> Self;
     /// Returns the lanes where |self| > `bound`.
@@ -547,6 +549,7 @@ mod tests {
                         a.mul_add(b, a),
                         a.mul_sub(b, b),
                         a.larger(b),
+                        a.smaller(b),
                         a.farther(b),
                         V::select(far, a, b),
                         a.keep(mask),

@@ -42,6 +42,10 @@ macro_rules! vector {
                 unsafe { Self::select($i::greater(self.0, other.0), self, other) }
             }
             #[inline(always)]
+            fn smaller(self, other: Self) -> Self {
+                unsafe { Self::select($i::greater(other.0, self.0), self, other) }
+            }
+            #[inline(always)]
             fn farther(self, other: Self) -> Self {
                 unsafe { $name($i::magnitude(self.0)).larger($name($i::magnitude(other.0))) }
             }

@@ -90,6 +90,10 @@ macro_rules! plain {
                 $name($(if self.$lane > other.$lane { self.$lane } else { other.$lane }),*)
             }
             #[inline(always)]
+            fn smaller(self, other: Self) -> Self {
+                $name($(if self.$lane < other.$lane { self.$lane } else { other.$lane }),*)
+            }
+            #[inline(always)]
             fn farther(self, other: Self) -> Self {
                 let (a, b) = ($name($(self.$lane.magnitude()),*), $name($(other.$lane.magnitude()),*));
                 a.larger(b)

@@ -67,6 +67,10 @@ macro_rules! vector {
                 unsafe { $name($i::larger(self.0, other.0)) }
             }
             #[inline(always)]
+            fn smaller(self, other: Self) -> Self {
+                unsafe { $name($i::smaller(self.0, other.0)) }
+            }
+            #[inline(always)]
             fn prefetch(at: *const $real) {
                 unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) }
             }
@@ -214,7 +218,7 @@ mod wide_f32 {
         _mm512_castps_si512 as bits, _mm512_castsi512_ps as real, _mm512_cmp_ps_mask as compare, _mm512_div_ps as div,
         _mm512_fmadd_ps as mul_add, _mm512_fmsub_ps as mul_sub, _mm512_fnmadd_ps as minus, _mm512_loadu_ps as load,
         _mm512_mask_mov_ps as select, _mm512_mask_permutexvar_ps as pick_some, _mm512_maskz_mov_ps as keep,
-        _mm512_max_ps as larger, _mm512_mul_ps as mul, _mm512_permutex2var_ps as pick_of_two,
+        _mm512_max_ps as larger, _mm512_min_ps as smaller, _mm512_mul_ps as mul, _mm512_permutex2var_ps as pick_of_two,
         _mm512_permutexvar_ps as pick, _mm512_range_ps as range, _mm512_set1_epi32 as splat_bits,
         _mm512_set1_ps as splat, _mm512_shuffle_ps as shuffle, _mm512_slli_epi32 as left, _mm512_sqrt_ps as root,
         _mm512_srli_epi32 as half_bits, _mm512_storeu_ps as store, _mm512_sub_epi32 as sub_bits, _mm512_sub_ps as sub,
@@ -253,9 +257,9 @@ mod wide_f64 {
         __m512d as Register, _mm512_abs_pd as magnitude, _mm512_add_pd as add, _mm512_alignr_epi64 as align,
         _mm512_castpd_si512 as bits, _mm512_castsi512_pd as real, _mm512_cmp_pd_mask as compare, _mm512_div_pd as div,
         _mm512_fmadd_pd as mul_add, _mm512_fmsub_pd as mul_sub, _mm512_fnmadd_pd as minus, _mm512_loadu_pd as load,
-        _mm512_mask_mov_pd as select, _mm512_maskz_mov_pd as keep, _mm512_max_pd as larger, _mm512_mul_pd as mul,
-        _mm512_range_pd as range, _mm512_set1_epi64 as splat_bits, _mm512_set1_pd as splat, _mm512_slli_epi64 as left,
-        _mm512_sqrt_pd as root, _mm512_srli_epi64 as half_bits, _mm512_storeu_pd as store,
+        _mm512_mask_mov_pd as select, _mm512_maskz_mov_pd as keep, _mm512_max_pd as larger, _mm512_min_pd as smaller,
+        _mm512_mul_pd as mul, _mm512_range_pd as range, _mm512_set1_epi64 as splat_bits, _mm512_set1_pd as splat,
+        _mm512_slli_epi64 as left, _mm512_sqrt_pd as root, _mm512_srli_epi64 as half_bits, _mm512_storeu_pd as store,
         _mm512_sub_epi64 as sub_bits, _mm512_sub_pd as sub, _mm512_test_epi64_mask as test_bits,
     };
 }
@@ -265,10 +269,11 @@ mod narrow_f32 {
         _mm256_andnot_ps as and_not, _mm256_blendv_ps as select, _mm256_castps_si256 as bits,
         _mm256_castsi256_ps as real, _mm256_cmp_ps as compare, _mm256_div_ps as div, _mm256_fmadd_ps as mul_add,
         _mm256_fmsub_ps as mul_sub, _mm256_fnmadd_ps as minus, _mm256_loadu_ps as load, _mm256_max_ps as larger,
-        _mm256_movemask_ps as signs, _mm256_mul_ps as mul, _mm256_or_ps as or, _mm256_permute2f128_ps as halves,
-        _mm256_set1_epi32 as splat_bits, _mm256_set1_ps as splat, _mm256_shuffle_ps as shuffle,
-        _mm256_slli_epi32 as left, _mm256_sqrt_ps as root, _mm256_srli_epi32 as half_bits, _mm256_storeu_ps as store,
-        _mm256_sub_epi32 as sub_bits, _mm256_sub_ps as sub, _mm256_unpackhi_ps as high, _mm256_unpacklo_ps as low,
+        _mm256_min_ps as smaller, _mm256_movemask_ps as signs, _mm256_mul_ps as mul, _mm256_or_ps as or,
+        _mm256_permute2f128_ps as halves, _mm256_set1_epi32 as splat_bits, _mm256_set1_ps as splat,
+        _mm256_shuffle_ps as shuffle, _mm256_slli_epi32 as left, _mm256_sqrt_ps as root,
+        _mm256_srli_epi32 as half_bits, _mm256_storeu_ps as store, _mm256_sub_epi32 as sub_bits, _mm256_sub_ps as sub,
+        _mm256_unpackhi_ps as high, _mm256_unpacklo_ps as low,
     };
     use std::arch::x86_64::{
         _mm_loadu_ps as load_record, _mm256_castps128_ps256 as begin, _mm256_insertf128_ps as insert,
@@ -290,8 +295,8 @@ mod narrow_f64 {
         __m256d as Register, _mm256_add_pd as add, _mm256_and_pd as and, _mm256_andnot_pd as and_not,
         _mm256_blendv_pd as select, _mm256_castpd_si256 as bits, _mm256_castsi256_pd as real, _mm256_cmp_pd as compare,
         _mm256_div_pd as div, _mm256_fmadd_pd as mul_add, _mm256_fmsub_pd as mul_sub, _mm256_fnmadd_pd as minus,
-        _mm256_loadu_pd as load, _mm256_max_pd as larger, _mm256_movemask_pd as signs, _mm256_mul_pd as mul,
-        _mm256_or_pd as or, _mm256_permute2f128_pd as halves, _mm256_set1_epi64x as splat_bits,
+        _mm256_loadu_pd as load, _mm256_max_pd as larger, _mm256_min_pd as smaller, _mm256_movemask_pd as signs,
+        _mm256_mul_pd as mul, _mm256_or_pd as or, _mm256_permute2f128_pd as halves, _mm256_set1_epi64x as splat_bits,
         _mm256_set1_pd as splat, _mm256_shuffle_pd as shuffle, _mm256_slli_epi64 as left, _mm256_sqrt_pd as root,
         _mm256_srli_epi64 as half_bits, _mm256_storeu_pd as store, _mm256_sub_epi64 as sub_bits, _mm256_sub_pd as sub,
     };
