@@ -2558,8 +2558,8 @@ pub struct Solid {
     #[prost(message, repeated, tag = "9")]
     pub layers: ::prost::alloc::vec::Vec<Layer>,
     /// η, viscosity (Kelvin–Voigt), Pa·s; 0 or more. All stress is that of the strain plus η/μ times its rate, with μ the shear
-    /// modulus; where E is larger, so is the viscosity. If absent 0.095, but η/μ at
-    /// most 34 µs.
+    /// modulus; where E is larger, so is the viscosity. If absent 0.097, but η/μ at
+    /// most 35 µs.
     #[prost(double, optional, tag = "10")]
     pub viscosity_pa_s: ::core::option::Option<f64>,
     /// Stiffness of a foundation under all of the surface: each part of it is pulled back to where it rests, by this for each area and

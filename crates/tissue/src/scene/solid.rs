@@ -62,14 +62,14 @@ impl SolidMaterial {
     /// Message of the refusal of a coefficient beside the material ([`Reason::WrongKind`]).
     pub const FOLLOWS: &str = "does not go with [solid], whose [material] gives it";
 
-    /// Returns a material of usual soft tissue, to start from: 8 kPa, ν 0.45, 1060 kg/m³, damping of 20/s, 0.095 Pa·s.
+    /// Returns a material of usual soft tissue, to start from: 8 kPa, ν 0.45, 1060 kg/m³, damping of 20/s, 0.097 Pa·s.
     pub fn usual() -> Self {
         SolidMaterial {
             youngs_modulus_pa: 8e3,
             poissons_ratio: 0.45,
             density_kg_per_m3: 1060.0,
             damping_per_s: 20.0,
-            viscosity_pa_s: 0.095,
+            viscosity_pa_s: 0.097,
         }
     }
 
@@ -87,7 +87,7 @@ impl SolidMaterial {
         Ok(material)
     }
 
-    /// Returns the material with a viscosity, Pa·s. `None` is the usual one: 0.095 Pa·s, or so much that η/μ is 34 µs if that is less,
+    /// Returns the material with a viscosity, Pa·s. `None` is the usual one: 0.097 Pa·s, or so much that η/μ is 35 µs if that is less,
     /// so that it does not damp what cells show well.
     pub fn with_viscosity(self, viscosity_pa_s: Option<f64>) -> Self {
         let usual = Self::usual();
@@ -490,11 +490,11 @@ impl BodyKind for Solid {
         self.material.viscous_time_s()
     }
 
-    /// A rehearsal pushes points of a small block, and a whole solid also has slower vibrations. (90 random solids at two tolerances:
-    /// at most 4.4 times, half of them 0.07 times. What `stormer` errs by in a viscous solid depends less on the motion: in 40 of
-    /// them at most 0.92 times.)
+    /// A rehearsal pushes points of a small block, and a whole solid also has slower vibrations. (300 random solids at two tolerances:
+    /// at most 4.7 times, half of them 0.07 times. What `stormer` errs by in a viscous solid depends less on the motion: of 171 choices
+    /// at most 3.3 times, three of them more than 1.5 times.)
     fn rehearsal_margin(&self, integrator: Integrator) -> f64 {
-        if integrator == Integrator::Stormer && self.viscous_time_s() > 0.0 { 3.0 } else { 5.0 }
+        if integrator == Integrator::Stormer && self.viscous_time_s() > 0.0 { 3.4 } else { 5.0 }
     }
 
     /// With it a rehearsed block is strained by about a tenth, and not so far that the limits of the law count.

@@ -28,21 +28,26 @@
 //! **Limits.** The law stiffens as λ|cof F|², and as μ|F|. So that a substep that is stable at rest stays stable however far
 //! the tissue is pressed or pulled, W = μ(½|H|² + tr H) + ψ has in place of ψ = ½(λ + μ)(J − 1)² − μ(J − 1)
 //!
-//! g·ψ, g = min(1, S/s), s = |cof F|², with S = [`SOFTENS`],
+//! g·ψ, g = 1/√(1 + t²), t = max(0, s − S₀)/S₁, s = |cof F|², with S₀ = [`SOFTENS`] and S₁ = [`SOFTENS_OVER`]: g·s is at most
+//! √(S₀² + S₁²) = 3.5,
 //!
-//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2gψ/s·(|F|²F − F·Fᵀ·F) where
-//! g < 1. (A force that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside
-//! out.) Pressed by half of its height, a block gives way as without limits.
+//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2tg³ψ/S₁·(|F|²F − F·Fᵀ·F). (A force
+//! that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside out. With g = min(1, S/s)
+//! the stress jumps at s = S, and a cube that stays there has no force that substeps of any length find.) Pressed by half of its
+//! height, a block gives way as without limits.
 #![allow(unsafe_code, clippy::needless_range_loop)]
 
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
 /// |cof F|² from which on ψ is reduced; 3 at rest.
-const SOFTENS: f64 = 3.5;
+const SOFTENS: f64 = 3.25;
 
-/// |4F|² up to which |cof F|² is below [`SOFTENS`]: 16·√(3·3.5), less a thousandth for rounding.
-const MAY_SOFTEN: f64 = 51.79;
+/// How far beyond that ψ is reduced to 1/√2.
+const SOFTENS_OVER: f64 = 1.3;
+
+/// |4F|² up to which |cof F|² is below [`SOFTENS`]: 16·√(3·3.25), less a thousandth for rounding.
+const MAY_SOFTEN: f64 = 49.91;
 
 /// The largest pressure, in μ.
 const LARGEST: f64 = 5.0;
@@ -239,14 +244,18 @@ impl<T: Real> NeoHookean<T> {
         let mut q = bulk.mul(w.splat(T::of(0.0625))).mul(growing).sub(shear);
         let mut far = None;
         if V::any(may_soften(h, diagonal)) {
-            let (squares, most) = (squares(&cofactor), w.splat(T::of(256.0 * SOFTENS)));
-            let is_far = squares.above(most);
-            let psi = Self::psi(growth, growing, pressure, shear);
-            let part = most.div(squares.larger(most));
-            let sixteen = w.splat(T::of(16.0));
-            q = V::select(is_far, q.mul(part), q);
-            pressure = V::select(is_far, sixteen.mul(q.add(shear)), pressure);
-            far = Some((is_far, part.mul(psi).mul(w.splat(T::of(-2.0))).div(squares)));
+            let squares = squares(&cofactor);
+            let is_far = squares.above(w.splat(T::of(256.0 * SOFTENS)));
+            if V::any(is_far) {
+                let psi = Self::psi(growth, growing, pressure, shear);
+                let (t, root) = excess(squares);
+                let part = w.splat(T::of(1.0)).div(root);
+                let sixteen = w.splat(T::of(16.0));
+                q = V::select(is_far, q.mul(part), q);
+                pressure = V::select(is_far, sixteen.mul(q.add(shear)), pressure);
+                let of_squares = t.mul(part).mul(part.mul(part)).mul(w.splat(T::of(-2.0 / (256.0 * SOFTENS_OVER))));
+                far = Some((is_far, of_squares.mul(psi)));
+            }
         }
         // 16 P, all times the weight: 4μ·h + q·e + 16(q + μ)·I, where q is g·ψ′ and `pressure` 16(q + μ).
         let shear_four = shear.mul(w.splat(T::of(4.0)));
@@ -294,8 +303,8 @@ impl<T: Real> NeoHookean<T> {
         let pressure = bulk.mul(growing);
         // ψ + μ(J − 1), without the difference of large numbers at small h; then (g − 1)·ψ.
         let swelling = pressure.mul(w.splat(T::of(0.0625))).mul(growth.minus(w.splat(T::of(0.5)), growing));
-        let most = w.splat(T::of(256.0 * SOFTENS));
-        let less = most.div(squares(&cofactor).larger(most)).sub(w.splat(T::of(1.0)));
+        let (t, root) = excess(squares(&cofactor));
+        let less = zero.sub(t.mul(t)).div(root.mul(root.add(w.splat(T::of(1.0)))));
         let reduced = less.mul(Self::psi(growth, growing, pressure, shear));
         shear.mul_add(of_h.add(of_g), swelling.add(reduced))
     }
@@ -364,6 +373,14 @@ fn squares<V: Vector>(cofactor: &[[V; 3]; 3]) -> V {
         }
     }
     squares
+}
+
+/// Returns t and √(1 + t²), from 256|cof F|². A cube that is crushed beyond all measure still has both.
+#[inline(always)]
+fn excess<V: Vector>(squares: V) -> (V, V) {
+    let of = |value: f64| squares.splat(V::Real::of(value));
+    let t = squares.sub(of(256.0 * SOFTENS)).mul(of(1.0 / (256.0 * SOFTENS_OVER))).larger(of(0.0)).smaller(of(1e9));
+    (t, t.mul_add(t, of(1.0)).root())
 }
 
 /// Returns |A|²A − A·Aᵀ·A of A = 4F = 4 + h: half the derivative of |cof A|².

@@ -63,7 +63,7 @@ fn some(size: f64) -> Corners {
 
 #[test]
 fn a_cube_pulls_with_the_derivative_of_its_energy_also_within_the_limits() {
-    // In the last three |cof F|² is above 3.5, and in some the pressure is the largest.
+    // In the last three ψ is reduced, and in some the pressure is the largest.
     for size in [0.02, 0.3, 1.0, 3.0] {
         let corners = some(size);
         let found = forces(&corners);
@@ -81,6 +81,19 @@ fn a_cube_pulls_with_the_derivative_of_its_energy_also_within_the_limits() {
                 assert!(error < 1e-7, "{size} {corner} {c}: {} {expected}", found[corner][c]);
             }
         }
+    }
+}
+
+/// A jump would be a change that is much larger than those before and after it.
+#[test]
+fn the_force_of_a_cube_that_is_strained_more_and_more_has_no_jump() {
+    let towards = some(1.0);
+    let courses: Vec<Corners> =
+        (0..20_000).map(|step| forces(&towards.map(|of| 1e-4 * f64::from(step) * of))).collect();
+    let change = |a: &Corners, b: &Corners| a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
+    let changes: Vec<f64> = courses.windows(2).map(|pair| change(&pair[0], &pair[1])).collect();
+    for (step, near) in changes.windows(3).enumerate() {
+        assert!(near[1] < 2.0 * near[0].max(near[2]), "{step}: {near:?}");
     }
 }
 
