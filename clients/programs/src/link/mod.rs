@@ -111,7 +111,8 @@ pub(crate) struct LinkArguments {
     /// Seed of the task and the network
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Place of the task, m: the nearest place of the tissue's rest surface; for a sheet X,Y [default: the middle]
+    /// Place of the task, m: the nearest place of the tissue's rest surface; for a sheet X,Y [default: the middle; on
+    /// a solid the top]
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["random", "boundary"])]
     place: Vec<f64>,
     /// The tool's tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid
@@ -251,7 +252,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     check_tip("--tip", scene.shape(), &tip)?;
     let model = Model::compile(&scene, &limits)?;
     let near_m = match (arguments.place.as_slice(), model.shape().dimensions()) {
-        ([], _) => model.shape().extent().middle_m(),
+        ([], _) => model.shape().pressed_m(),
         ([x, y], 2) => DVec3::new(*x, *y, 0.0),
         ([x, y, z], _) => DVec3::new(*x, *y, *z),
         (_, count) => {
