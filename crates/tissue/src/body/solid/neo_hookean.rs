@@ -28,12 +28,13 @@
 //! **Limits.** The law stiffens as λ|cof F|², and as μ|F|. So that a substep that is stable at rest stays stable however far
 //! the tissue is pressed or pulled, W = μ(½|H|² + tr H) + ψ has in place of ψ = ½(λ + μ)(J − 1)² − μ(J − 1)
 //!
-//! g·ψ, g = 1/√(1 + t²), t = max(0, s − S₀)/S₁, s = |cof F|², with S₀ = [`SOFTENS`] and S₁ = [`SOFTENS_OVER`]: g·s is at most
-//! √(S₀² + S₁²) = 3.5,
+//! g·ψ, g = 1/√(1 + t²), t = x²/(x + b), x = max(0, s − S₀)/S₁, s = |cof F|², with S₀ = [`SOFTENS`], S₁ = [`SOFTENS_OVER`] and
+//! b = [`SETS_IN`], so that g·s is at most 3.5;
 //!
-//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2tg³ψ/S₁·(|F|²F − F·Fᵀ·F). (A force
-//! that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside out. With g = min(1, S/s)
-//! the stress jumps at s = S, and a cube that stays there has no force that substeps of any length find.) Pressed by half of its
+//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2g³tt′ψ/S₁·(|F|²F − F·Fᵀ·F). (A
+//! force that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside out. With g = min(1,
+//! S/s) the stress jumps at s = S, and a cube that stays there has no force that substeps of any length find. t begins as x², so
+//! that the stiffness does not jump either, and schemes of high order keep their order.) Pressed by half of its
 //! height, a block gives way as without limits.
 #![allow(unsafe_code, clippy::needless_range_loop)]
 
@@ -41,13 +42,14 @@ use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
 /// |cof F|² from which on ψ is reduced; 3 at rest.
-const SOFTENS: f64 = 3.25;
+const SOFTENS: f64 = 3.15;
 
-/// How far beyond that ψ is reduced to 1/√2.
-const SOFTENS_OVER: f64 = 1.3;
+/// The scale on which it is reduced, and the part of it on which that sets in.
+const SOFTENS_OVER: f64 = 1.076;
+const SETS_IN: f64 = 0.25;
 
-/// |4F|² up to which |cof F|² is below [`SOFTENS`]: 16·√(3·3.25), less a thousandth for rounding.
-const MAY_SOFTEN: f64 = 49.91;
+/// |4F|² up to which |cof F|² is below [`SOFTENS`]: 16·√(3·3.15), less a thousandth for rounding.
+const MAY_SOFTEN: f64 = 49.13;
 
 /// The largest pressure, in μ.
 const LARGEST: f64 = 5.0;
@@ -248,12 +250,13 @@ impl<T: Real> NeoHookean<T> {
             let is_far = squares.above(w.splat(T::of(256.0 * SOFTENS)));
             if V::any(is_far) {
                 let psi = Self::psi(growth, growing, pressure, shear);
-                let (t, root) = excess(squares);
+                let Excess { t, slope, root } = Excess::of(squares);
                 let part = w.splat(T::of(1.0)).div(root);
                 let sixteen = w.splat(T::of(16.0));
                 q = V::select(is_far, q.mul(part), q);
                 pressure = V::select(is_far, sixteen.mul(q.add(shear)), pressure);
-                let of_squares = t.mul(part).mul(part.mul(part)).mul(w.splat(T::of(-2.0 / (256.0 * SOFTENS_OVER))));
+                let of_squares =
+                    t.mul(slope).mul(part.mul(part)).mul(part).mul(w.splat(T::of(-2.0 / (256.0 * SOFTENS_OVER))));
                 far = Some((is_far, of_squares.mul(psi)));
             }
         }
@@ -303,7 +306,7 @@ impl<T: Real> NeoHookean<T> {
         let pressure = bulk.mul(growing);
         // ψ + μ(J − 1), without the difference of large numbers at small h; then (g − 1)·ψ.
         let swelling = pressure.mul(w.splat(T::of(0.0625))).mul(growth.minus(w.splat(T::of(0.5)), growing));
-        let (t, root) = excess(squares(&cofactor));
+        let Excess { t, root, .. } = Excess::of(squares(&cofactor));
         let less = zero.sub(t.mul(t)).div(root.mul(root.add(w.splat(T::of(1.0)))));
         let reduced = less.mul(Self::psi(growth, growing, pressure, shear));
         shear.mul_add(of_h.add(of_g), swelling.add(reduced))
@@ -375,12 +378,26 @@ fn squares<V: Vector>(cofactor: &[[V; 3]; 3]) -> V {
     squares
 }
 
-/// Returns t and √(1 + t²), from 256|cof F|². A cube that is crushed beyond all measure still has both.
-#[inline(always)]
-fn excess<V: Vector>(squares: V) -> (V, V) {
-    let of = |value: f64| squares.splat(V::Real::of(value));
-    let t = squares.sub(of(256.0 * SOFTENS)).mul(of(1.0 / (256.0 * SOFTENS_OVER))).larger(of(0.0)).smaller(of(1e9));
-    (t, t.mul_add(t, of(1.0)).root())
+/// How far |cof F|² is beyond [`SOFTENS`]. A cube that is crushed beyond all measure has finite values too.
+struct Excess<V> {
+    t: V,
+    /// dt/dx.
+    slope: V,
+    /// √(1 + t²).
+    root: V,
+}
+
+impl<V: Vector> Excess<V> {
+    /// Computes it from 256|cof F|².
+    #[inline(always)]
+    fn of(squares: V) -> Self {
+        let of = |value: f64| squares.splat(V::Real::of(value));
+        let x = squares.sub(of(256.0 * SOFTENS)).mul(of(1.0 / (256.0 * SOFTENS_OVER))).larger(of(0.0)).smaller(of(1e9));
+        let inverse = of(1.0).div(x.add(of(SETS_IN)));
+        let t = x.mul(x).mul(inverse);
+        let slope = x.mul(x.add(of(2.0 * SETS_IN))).mul(inverse).mul(inverse);
+        Excess { t, slope, root: t.mul_add(t, of(1.0)).root() }
+    }
 }
 
 /// Returns |A|²A − A·Aᵀ·A of A = 4F = 4 + h: half the derivative of |cof A|².
