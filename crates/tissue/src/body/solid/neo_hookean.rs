@@ -28,13 +28,13 @@
 //! **Limits.** The law stiffens as λ|cof F|², and as μ|F|. So that a substep that is stable at rest stays stable however far
 //! the tissue is pressed or pulled, W = μ(½|H|² + tr H) + ψ has in place of ψ = ½(λ + μ)(J − 1)² − μ(J − 1)
 //!
-//! g·ψ, g = 1/√(1 + t²), t = x²/(x + b), x = max(0, s − S₀)/S₁, s = |cof F|², with S₀ = [`SOFTENS`], S₁ = [`SOFTENS_OVER`] and
-//! b = [`SETS_IN`], so that g·s is at most 3.5;
+//! g·ψ, g = s̄/s, s̄ = S + D·y/√(1 + y²), y = max(0, s − S)/D, s = |cof F|², with S = [`SOFTENS`] and D = [`SOFTENS_OVER`]: so s̄
+//! is s up to S, and never more than S + D;
 //!
-//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F − 2g³tt′ψ/S₁·(|F|²F − F·Fᵀ·F). (A
-//! force that is only reduced there is the gradient of no energy, and kept cubes moving that were turned inside out. With g = min(1,
-//! S/s) the stress jumps at s = S, and a cube that stays there has no force that substeps of any length find. t begins as x², so
-//! that the stiffness does not jump either, and schemes of high order keep their order.) Pressed by half of its
+//! and |(λ + μ)(J − 1)| grows no further than to [`LARGEST`]·μ. Its derivative is g·ψ′·cof F + 2g′ψ·(|F|²F − F·Fᵀ·F) with
+//! g′ = ((1 + y²)^(−3/2) − g)/s. (A force that is only reduced there is the gradient of no energy, and kept cubes moving that were
+//! turned inside out. With s̄ = min(s, 3.5) the stress jumps, and a cube that stays there has no force that substeps of any length
+//! find. Here s̄ has no jump up to its second derivative, and schemes of high order keep their order.) Pressed by half of its
 //! height, a block gives way as without limits.
 #![allow(unsafe_code, clippy::needless_range_loop)]
 
@@ -44,9 +44,8 @@ use crate::kernel::real::Real;
 /// |cof F|² from which on ψ is reduced; 3 at rest.
 const SOFTENS: f64 = 3.15;
 
-/// The scale on which it is reduced, and the part of it on which that sets in.
-const SOFTENS_OVER: f64 = 1.076;
-const SETS_IN: f64 = 0.25;
+/// How much more |cof F|² counts at most.
+const SOFTENS_OVER: f64 = 0.4;
 
 /// |4F|² up to which |cof F|² is below [`SOFTENS`]: 16·√(3·3.15), less a thousandth for rounding.
 const MAY_SOFTEN: f64 = 49.13;
@@ -250,14 +249,11 @@ impl<T: Real> NeoHookean<T> {
             let is_far = squares.above(w.splat(T::of(256.0 * SOFTENS)));
             if V::any(is_far) {
                 let psi = Self::psi(growth, growing, pressure, shear);
-                let Excess { t, slope, root } = Excess::of(squares);
-                let part = w.splat(T::of(1.0)).div(root);
+                let Softening { part, slope } = Softening::of(squares);
                 let sixteen = w.splat(T::of(16.0));
                 q = V::select(is_far, q.mul(part), q);
                 pressure = V::select(is_far, sixteen.mul(q.add(shear)), pressure);
-                let of_squares =
-                    t.mul(slope).mul(part.mul(part)).mul(part).mul(w.splat(T::of(-2.0 / (256.0 * SOFTENS_OVER))));
-                far = Some((is_far, of_squares.mul(psi)));
+                far = Some((is_far, slope.mul(psi).mul(w.splat(T::of(2.0)))));
             }
         }
         // 16 P, all times the weight: 4μ·h + q·e + 16(q + μ)·I, where q is g·ψ′ and `pressure` 16(q + μ).
@@ -306,8 +302,7 @@ impl<T: Real> NeoHookean<T> {
         let pressure = bulk.mul(growing);
         // ψ + μ(J − 1), without the difference of large numbers at small h; then (g − 1)·ψ.
         let swelling = pressure.mul(w.splat(T::of(0.0625))).mul(growth.minus(w.splat(T::of(0.5)), growing));
-        let Excess { t, root, .. } = Excess::of(squares(&cofactor));
-        let less = zero.sub(t.mul(t)).div(root.mul(root.add(w.splat(T::of(1.0)))));
+        let less = Softening::of(squares(&cofactor)).part.sub(w.splat(T::of(1.0)));
         let reduced = less.mul(Self::psi(growth, growing, pressure, shear));
         shear.mul_add(of_h.add(of_g), swelling.add(reduced))
     }
@@ -378,25 +373,26 @@ fn squares<V: Vector>(cofactor: &[[V; 3]; 3]) -> V {
     squares
 }
 
-/// How far |cof F|² is beyond [`SOFTENS`]. A cube that is crushed beyond all measure has finite values too.
-struct Excess<V> {
-    t: V,
-    /// dt/dx.
+/// How much ψ is reduced. A cube that is crushed beyond all measure has finite values too.
+struct Softening<V> {
+    /// g.
+    part: V,
+    /// Its derivative by 256|cof F|².
     slope: V,
-    /// √(1 + t²).
-    root: V,
 }
 
-impl<V: Vector> Excess<V> {
+impl<V: Vector> Softening<V> {
     /// Computes it from 256|cof F|².
     #[inline(always)]
     fn of(squares: V) -> Self {
         let of = |value: f64| squares.splat(V::Real::of(value));
-        let x = squares.sub(of(256.0 * SOFTENS)).mul(of(1.0 / (256.0 * SOFTENS_OVER))).larger(of(0.0)).smaller(of(1e9));
-        let inverse = of(1.0).div(x.add(of(SETS_IN)));
-        let t = x.mul(x).mul(inverse);
-        let slope = x.mul(x.add(of(2.0 * SETS_IN))).mul(inverse).mul(inverse);
-        Excess { t, slope, root: t.mul_add(t, of(1.0)).root() }
+        let squares = squares.larger(of(256.0 * SOFTENS));
+        let y = squares.sub(of(256.0 * SOFTENS)).mul(of(1.0 / (256.0 * SOFTENS_OVER))).smaller(of(1e9));
+        let inverse_root = of(1.0).div(y.mul_add(y, of(1.0)).root());
+        let counted = y.mul(inverse_root).mul_add(of(256.0 * SOFTENS_OVER), of(256.0 * SOFTENS));
+        let part = counted.div(squares);
+        let slope_of_counted = inverse_root.mul(inverse_root).mul(inverse_root);
+        Softening { part, slope: slope_of_counted.sub(part).div(squares) }
     }
 }
 
