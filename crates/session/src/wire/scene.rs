@@ -48,7 +48,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
             return Err(Refusal::new(Reason::WrongKind, "solid", message));
         }
     };
-    let stepping = Stepping::usual(substance.body.kind());
+    let stepping = substance.body.kind().usual_stepping();
     Ok(Scene {
         name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
         body: substance.body,

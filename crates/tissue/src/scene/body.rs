@@ -6,11 +6,11 @@ use std::sync::Arc;
 
 use palpate_geometry::TriangleMesh;
 
-use super::Integrator;
 use super::graph::MeshGraph;
 use super::profile::Poke;
 use super::source::Files;
 use super::springs::Springs;
+use super::stepping::{Integrator, Stepping};
 use super::toml_document::Fields;
 use super::volume::Volume;
 use crate::limits::Limits;
@@ -224,9 +224,9 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         None
     }
 
-    /// Returns the allowed error of stepping for a scene that does not say it.
-    fn usual_tolerance(&self) -> f64 {
-        1e-5
+    /// Returns the stepping of a tissue whose scene says nothing about it.
+    fn usual_stepping(&self) -> Stepping {
+        Stepping::default()
     }
 
     /// Returns the measured cost of a point relative to a point of a sheet.

@@ -11,6 +11,7 @@ pub mod kind;
 mod material;
 mod membrane;
 mod mesh;
+mod named;
 pub mod plot;
 pub mod profile;
 pub mod record;
@@ -22,6 +23,7 @@ mod shown;
 mod solid;
 mod source;
 mod springs;
+mod stepping;
 pub mod toml_document;
 mod volume;
 mod zero;
@@ -39,12 +41,14 @@ use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 use mesh::read_bending;
 pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors};
-use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
+pub use named::Named;
+use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{Shown, Simulated};
 pub use solid::{CellSize, FixedPart, Gravity, Layer, Solid, SolidMaterial, SolidShape};
 use source::Files;
 pub use springs::Springs;
+pub use stepping::{Integrator, Lanes, Precision, Stepping};
 use toml_document::{Document, Fields, Item};
 pub use volume::{Swelling, Volume};
 
@@ -283,157 +287,6 @@ impl Change {
                                volume_stiffness_pa";
 }
 
-/// How time advances: rate, accuracy, scheme and number format, as a user asks for them. `default()` has the
-/// defaults named below.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Stepping {
-    /// Steps per second, Hz, from 1e-3 to 1e7. Commands take effect and samples are taken once per step.
-    /// Default: 1000.
-    pub rate_hz: f64,
-    /// Wanted error of displacement and force, each relative to the largest of its kind; above 0 and at most 1.
-    /// Default: 1e-5, of a solid 1e-2 ([`Stepping::usual`]).
-    pub tolerance: f64,
-    /// The scheme that advances the points in time. Default: `auto`.
-    pub integrator: Integrator,
-    /// Substeps per step, from 1 to the limit `substeps`. If `None` (the default), the tolerance and the
-    /// stability bound decide.
-    pub substeps: Option<u32>,
-    /// The number format of the state. Default: `auto`.
-    pub precision: Precision,
-    /// How many numbers the processor works on at once. Default: `auto`.
-    pub lanes: Lanes,
-    /// Whether the tissue is stepped more accurately after an audit finds an error above the tolerance.
-    /// Default: false.
-    pub correct: bool,
-}
-
-impl Default for Stepping {
-    fn default() -> Self {
-        Stepping {
-            rate_hz: 1000.0,
-            tolerance: 1e-5,
-            integrator: Integrator::Auto,
-            substeps: None,
-            precision: Precision::Auto,
-            lanes: Lanes::Auto,
-            correct: false,
-        }
-    }
-}
-
-impl Stepping {
-    /// Returns the stepping of a tissue of a kind whose scene says nothing about it.
-    pub fn usual(kind: &dyn BodyKind) -> Self {
-        Stepping { tolerance: kind.usual_tolerance(), ..Stepping::default() }
-    }
-}
-
-/// A value that a scene gives by a name from a list, such as an integrator.
-pub trait Named: Sized + Copy + PartialEq + 'static {
-    /// Every name and its value; each name and each value once.
-    const NAMES: &'static [(&'static str, Self)];
-
-    /// Returns the value of a name, which must match exactly; `field` is the key that a refusal gives.
-    ///
-    /// # Errors
-    /// Refuses a name that is not in the list ([`Reason::WrongKind`]); the message lists the names.
-    fn named(field: &str, name: &str) -> Result<Self> {
-        Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
-            let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
-            let meant = did_you_mean(name, names.iter().copied());
-            let message = format!("must be one of {}, but is `{}`{meant}", names.join(", "), excerpt(name));
-            Refusal::new(Reason::WrongKind, field, message)
-        })
-    }
-
-    /// Returns the name of a value; empty for a value that is not in the list.
-    fn name(self) -> &'static str {
-        Self::NAMES.iter().find(|entry| entry.1 == self).map_or("", |entry| entry.0)
-    }
-}
-
-/// Writes an enum whose values scenes give by names, and its [`Named::NAMES`], from one list.
-macro_rules! named {
-    ($(#[$of_enum:meta])* pub enum $Enum:ident { $($(#[$of_value:meta])* $Value:ident = $name:literal,)+ }) => {
-        $(#[$of_enum])*
-        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-        pub enum $Enum {
-            $($(#[$of_value])* $Value,)+
-        }
-
-        impl Named for $Enum {
-            const NAMES: &'static [(&'static str, Self)] = &[$(($name, $Enum::$Value)),+];
-        }
-    };
-}
-
-named! {
-    /// The schemes that advance the points in time (see the module `scheme`).
-    pub enum Integrator {
-        /// Palpate chooses, among `central` (of a viscous tissue `stormer`) and the exponential schemes.
-        Auto = "auto",
-        /// Central differences, damping implicit: second order.
-        Central = "central",
-        /// The paper's scheme: damping with the velocity of the last step, first order.
-        Lagged = "lagged",
-        /// The classical scheme of Runge and Kutta: fourth order, four evaluations of the forces per substep.
-        Rk4 = "rk4",
-        /// Exponential multistep with the last 2 forces of the springs: third order.
-        Exponential2 = "exponential2",
-        /// Exponential multistep with the last 3 forces of the springs: fourth order.
-        Exponential3 = "exponential3",
-        /// Exponential multistep with the last 4 forces of the springs: fifth order.
-        Exponential4 = "exponential4",
-        /// Central differences with the springs' last 2 forces: second order, with a smaller error than `central`. For tissue
-        /// without anchor springs.
-        Stormer = "stormer",
-    }
-}
-
-impl Integrator {
-    /// Returns whether the integrator steps tissue with anchor springs.
-    pub fn takes_anchor_springs(self) -> bool {
-        self != Integrator::Stormer
-    }
-
-    /// Returns the integrators that step tissue with anchor springs, without `auto`, in the order of [`Named::NAMES`].
-    pub fn of_anchored() -> impl Iterator<Item = Self> {
-        let all = Self::NAMES.iter().map(|entry| entry.1);
-        all.filter(|integrator| *integrator != Integrator::Auto && integrator.takes_anchor_springs())
-    }
-}
-
-named! {
-    /// The number format of the state.
-    pub enum Precision {
-        /// Palpate chooses for the tolerance.
-        Auto = "auto",
-        /// 4 bytes per number, single precision.
-        F32 = "f32",
-        /// 4 bytes per number, and 4 more that keep the rounding error of a displacement: for exponential
-        /// schemes.
-        Compensated = "compensated",
-        /// 8 bytes per number, double precision.
-        F64 = "f64",
-    }
-}
-
-named! {
-    /// How many numbers the processor works on at once. The bits of the results do not depend on it.
-    pub enum Lanes {
-        /// The widest that the machine has.
-        Auto = "auto",
-        /// Vectors of 64 bytes, on x86-64 with AVX-512.
-        Avx512 = "avx512",
-        /// Vectors of 32 bytes, on x86-64 with AVX2.
-        Avx2 = "avx2",
-        /// Vectors of 16 bytes, on ARM.
-        Neon = "neon",
-        /// One number at a time, on any machine; much slower.
-        Plain = "plain",
-    }
-}
-
 impl Scene {
     /// Returns the scene of the same tissue with cells of `cell_m` (m), unchecked. `None` for a tissue without cells, and if
     /// such cells do not fit.
@@ -514,7 +367,7 @@ impl Scene {
         let scene = document.read(|fields| {
             let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
             let substance = read_substance(fields, files, limits)?;
-            let stepping = Stepping::usual(substance.body.kind());
+            let stepping = substance.body.kind().usual_stepping();
             Ok(Scene {
                 name,
                 body: substance.body,
@@ -525,7 +378,7 @@ impl Scene {
                 damping_n_s_per_m: substance.damping_n_s_per_m,
                 volume_stiffness_pa: substance.volume_stiffness_pa,
                 stepping: match fields.item("stepping") {
-                    Some(item) => read_stepping(&item, stepping)?,
+                    Some(item) => Stepping::read(&item, stepping)?,
                     None => stepping,
                 },
                 sleep_tolerance: match fields.item("sleep") {
@@ -659,15 +512,8 @@ impl Scene {
         if self.volume_stiffness_pa > 0.0 && self.volume().is_none() {
             return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
         }
-        let stepping = &self.stepping;
         self.check_integrator()?;
-        number("stepping.rate_hz", stepping.rate_hz, "from 1e-3 to 1e7", |v| (1e-3..=1e7).contains(&v))?;
-        number("stepping.tolerance", stepping.tolerance, "above 0 and at most 1", |v| v > 0.0 && v <= 1.0)?;
-        if let Some(substeps) = stepping.substeps {
-            let range = format!("from 1 to {}", limits.substeps);
-            let holds = |v| v >= 1.0 && v <= f64::from(limits.substeps);
-            number("stepping.substeps", f64::from(substeps), &range, holds)?;
-        }
+        self.stepping.check(limits)?;
         if let Some(tolerance) = self.sleep_tolerance {
             number("sleep.tolerance", tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         }
@@ -900,37 +746,6 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
             surface: surface.unwrap_or(standard.surface),
             texture_seed: seed.unwrap_or(standard.texture_seed),
             texture_size,
-        })
-    })
-}
-
-fn read_stepping(item: &Item<'_>, standard: Stepping) -> Result<Stepping> {
-    item.table(|fields| {
-        Ok(Stepping {
-            rate_hz: fields.number("rate_hz")?.unwrap_or(standard.rate_hz),
-            tolerance: fields.number("tolerance")?.unwrap_or(standard.tolerance),
-            integrator: match fields.text("integrator")? {
-                Some(name) => Integrator::named(&fields.path("integrator"), &name)?,
-                None => standard.integrator,
-            },
-            substeps: match fields.item("substeps") {
-                Some(item) if item.as_text() == Some("auto") => None,
-                Some(item) if item.as_text().is_some() => return Err(item.wrong("\"auto\" or a whole number")),
-                Some(item) => {
-                    let whole = item.whole()?;
-                    Some(u32::try_from(whole).map_err(|_| item.refuse(Reason::OutOfRange, "is too large"))?)
-                }
-                None => None,
-            },
-            precision: match fields.text("precision")? {
-                Some(name) => Precision::named(&fields.path("precision"), &name)?,
-                None => standard.precision,
-            },
-            lanes: match fields.text("lanes")? {
-                Some(name) => Lanes::named(&fields.path("lanes"), &name)?,
-                None => standard.lanes,
-            },
-            correct: fields.item("correct").map_or(Ok(standard.correct), |item| item.flag())?,
         })
     })
 }

@@ -7,11 +7,11 @@ use glam::{DVec2, DVec3};
 
 use crate::limits::Limits;
 use crate::memory;
-use crate::scene::Integrator;
 use crate::scene::action_check::physical;
 use crate::scene::body::{BodyKind, KindOfBody};
 use crate::scene::source::Files;
 use crate::scene::springs::Springs;
+use crate::scene::stepping::Integrator;
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Deepest, Extent, GridCell, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};

@@ -15,8 +15,8 @@ use super::material::{Inclusion, MAX_INCLUSIONS, Region};
 use super::source::{Files, SourceMesh};
 use super::springs::Springs;
 use crate::limits::Limits;
-use crate::scene::Integrator;
 use crate::scene::action_check::physical;
+use crate::scene::stepping::{Integrator, Stepping};
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{CellPlace, PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
@@ -468,8 +468,8 @@ impl BodyKind for Solid {
     }
 
     /// The error of the cells is larger: some per cent.
-    fn usual_tolerance(&self) -> f64 {
-        1e-2
+    fn usual_stepping(&self) -> Stepping {
+        Stepping { tolerance: 1e-2, ..Stepping::default() }
     }
 
     fn cells(&self) -> Option<usize> {
