@@ -52,7 +52,7 @@ fn patterns_of(corners: &[DVec3; 8]) -> Patterns<One> {
 
 /// Returns the force on each corner, outward: what resists the displacement that causes it.
 #[inline(always)]
-fn resisting(stress: &Stress<One>) -> [DVec3; 8] {
+pub(super) fn resisting(stress: &Stress<One>) -> [DVec3; 8] {
     let mut forces = [DVec3::ZERO; 8];
     for c in 0..3 {
         let sides = [stress.on_near_side(c, [Scalar(0.0); 4]), stress.on_far_side(c)];

@@ -38,6 +38,11 @@ const GROUP: usize = 8;
 const CUBES: u8 = 2;
 const CORNERS_ALONE: u8 = 1;
 
+/// Values of a cube's stress, of a side, and of what waits for a corner of a plane.
+const STRESS_VALUES: usize = Stress::<Scalar<f64>>::VECTORS;
+const SIDE_VALUES: usize = 12;
+const PLANE_VALUES: usize = 6;
+
 /// What acts on the points of a solid besides its cubes: its weight, and a foundation.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PointLoad<T> {
@@ -122,13 +127,6 @@ impl<T: Real> Buffers<T> {
         self.shared_rows.fill(usize::MAX);
     }
 }
-
-/// Values of a cube's stress.
-const STRESS_VALUES: usize = Stress::<Scalar<f64>>::VECTORS;
-
-/// Values of a side, and what waits for a corner of a plane.
-const SIDE_VALUES: usize = 12;
-const PLANE_VALUES: usize = 6;
 
 impl<T: Real> SolidTables<T> {
     /// Creates the tables of a lattice.
@@ -229,14 +227,18 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
     /// Returns what the block of a row at a column has; `None` if it is not needed. A force that waits for a sleeping corner is
     /// never used, so it need not be right.
     #[inline(always)]
-    fn content<V: Vector<Real = T>>(&self, row: usize, column: usize, all_awake: bool) -> Option<u8> {
-        if !all_awake && !self.is_needed(row, [column, column + V::LANES]) {
-            return None;
-        }
+    fn needed<V: Vector<Real = T>>(&self, row: usize, column: usize, all_awake: bool) -> Option<u8> {
+        let is_needed = all_awake || self.is_needed(row, [column, column + V::LANES]);
+        is_needed.then(|| self.content::<V>(row, column))
+    }
+
+    /// Returns what the block of a row at a column has.
+    #[inline(always)]
+    fn content<V: Vector<Real = T>>(&self, row: usize, column: usize) -> u8 {
         let (groups, at) = (&self.grid.tables.groups, (row * self.grid.layout.stride + column) / GROUP);
         // SAFETY: a column of a row is in the plane, in whole blocks.
         let group = |at: usize| unsafe { *groups.get_unchecked(at) };
-        Some(if V::LANES > GROUP { group(at).max(group(at + 1)) } else { group(at) })
+        if V::LANES > GROUP { group(at).max(group(at + 1)) } else { group(at) }
     }
 
     /// Computes the stresses of row (j, k) of cubes.
@@ -260,7 +262,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
             let span = tables.spans[row].clone();
             let mut column = span.start;
             while column < span.end {
-                if self.content::<V>(row, column, all_awake) == Some(CUBES) {
+                if self.needed::<V>(row, column, all_awake) == Some(CUBES) {
                     let at = row * stride + column;
                     let (mut near, mut far) = ([[zero; 4]; 3], [[zero; 4]; 3]);
                     let of_block = shared.add(SIDE_VALUES * column);
@@ -316,7 +318,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
             let span = tables.spans[row].clone();
             let mut column = span.start;
             while column < span.end {
-                let Some(group) = self.content::<V>(row, column, all_awake) else {
+                let Some(group) = self.needed::<V>(row, column, all_awake) else {
                     before = [zero; 3];
                     column += V::LANES;
                     continue;
@@ -382,7 +384,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
             let mut column = span.start;
             while column < span.end {
                 let is_awake = all_awake || self.over.is_awake(row, column);
-                if is_awake && self.content::<V>(row, column, all_awake).is_some_and(|group| group != 0) {
+                if is_awake && self.content::<V>(row, column) != 0 {
                     let at = row * stride + column;
                     let mobility = V::load(tables.mobility.as_ptr().add(at));
                     let (mut here, mut n) = ([zero; 3], [zero; 3]);

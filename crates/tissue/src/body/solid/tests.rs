@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
-use super::linear_cells::LinearCells;
+use super::linear_cells::{LinearCells, resisting};
 use super::neo_hookean::{NeoHookean, Patterns};
 use crate::body::Places;
 use crate::body::model::{Model, Plan};
@@ -32,17 +32,7 @@ fn patterns(corners: &Corners) -> Patterns<Scalar<f64>> {
 
 fn forces(corners: &Corners) -> Corners {
     let stress = NeoHookean::new(1.0, SHEAR, LAME).stress(Scalar(0.7), &patterns(corners));
-    let found = [0, 1, 2]
-        .map(|c| [stress.on_near_side(c, [Scalar(0.0); 4]), stress.on_far_side(c)].map(|side| side.map(|of| of.0)));
-    std::array::from_fn(|corner| {
-        let [x, y, z] = [0, 1, 2].map(|bit| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 });
-        let of = |c: usize| {
-            let [all, of_z, of_x, of_xz] = found[c][usize::from(y > 0.0)];
-            // What the corner pulls with; the tissue pulls the other way.
-            -(all + z * of_z + x * of_x + x * z * of_xz)
-        };
-        DVec3::new(of(0), of(1), of(2))
-    })
+    resisting(&stress).map(|outward| -outward)
 }
 
 fn energy(corners: &Corners) -> f64 {
