@@ -298,6 +298,7 @@ fn flat(side: u32) -> TriangleMesh {
         uv: Some(vec![[[0.0; 2]; 3]; triangles.len()]),
         triangles,
         groups: Vec::new(),
+        regions: Vec::new(),
     }
 }
 

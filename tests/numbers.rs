@@ -348,6 +348,7 @@ fn octahedron() -> TriangleMesh {
         triangles: vec![[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]],
         uv: None,
         groups: vec![Group { name: "held".to_owned(), vertices: vec![5] }],
+        regions: Vec::new(),
     }
 }
 

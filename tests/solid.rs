@@ -2,6 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -14,13 +16,14 @@ use palpate_refusal::Reason;
 use palpate_session::command::Command;
 use palpate_session::indentation::Indentation;
 use palpate_session::intake::Intake;
+use palpate_session::journal::{JournalReader, JournalWriter, pb};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::saved::PlainTissue;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
-use palpate_tissue::scene::{self, Body, CellSize, Change, FixedPart, Scene, Solid, SolidMaterial};
+use palpate_tissue::scene::{self, Body, CellSize, Change, FixedPart, Named, Scene, Solid, SolidMaterial};
 use palpate_tissue::{Model, Push, Tissue, at_rest};
 
 /// A block of 60 × 60 × 30 mm that is held below, of a tissue of 8 kPa.
@@ -260,6 +263,169 @@ fn a_finger_that_moves_feels_the_viscosity() {
         println!("{scheme}: {elastic_n} {viscous_n} {rest_n}, {ratio} of what the rate says");
         assert!((0.9..1.1).contains(&ratio), "{scheme}: {ratio}");
     }
+}
+
+/// A tenth of the block's cells along each axis, of a tissue with branches.
+fn relaxing(branches: &[(f64, f64)], sets: &[&str]) -> Arc<Model> {
+    let branch = |(of_shear, time_s): &(f64, f64)| {
+        format!("[[branch]]\nshear_modulus_pa = {:?}\ntime_s = {time_s:?}\n", of_shear * 8e3 / 2.9)
+    };
+    let text = block_text("cell_m = 0.01") + &branches.iter().map(branch).collect::<String>();
+    let scene = read(&text, sets).unwrap();
+    Model::compile(&scene, &Limits::default()).unwrap()
+}
+
+/// Returns Σ γ·τ/T·(e^{T/τ} − 1)·e^{−t/τ}: what is left at `after_s` of branches that a strain filled evenly in the first `rise_s`.
+fn left(branches: &[(f64, f64)], rise_s: f64, after_s: f64) -> f64 {
+    let of = |(stiffness, time_s): &(f64, f64)| {
+        stiffness * time_s / rise_s * (rise_s / time_s).exp_m1() * (-after_s / time_s).exp()
+    };
+    branches.iter().map(of).sum()
+}
+
+#[test]
+fn a_held_press_relaxes_as_its_branches_say() {
+    let branches = [(0.8, 0.02), (0.5, 0.3), (0.3, 5.0)];
+    let felt_n = |branches: &[(f64, f64)], scheme: &str| -> Vec<f64> {
+        let sets = [format!("stepping.integrator=\"{scheme}\""), "stepping.substeps=16".to_owned()];
+        let mut tissue = at_rest(&relaxing(branches, &sets.each_ref().map(String::as_str)));
+        let felt_n = (1..=1000).map(|step| {
+            let depth_m = 5e-4 * (f64::from(step) / 50.0).min(1.0);
+            tissue.pose(0, DVec3::new(0.03, 0.03, 0.03 - depth_m), Tip::default());
+            tissue.step().unwrap();
+            tissue.tool_contact(0).unwrap().force_on_tool_n.z
+        });
+        let felt_n = felt_n.collect();
+        assert_eq!(tissue.guard_events(), 0);
+        felt_n
+    };
+    for scheme in ["stormer", "central", "lagged"] {
+        let (elastic_n, relaxing_n) = (felt_n(&[], scheme), felt_n(&branches, scheme));
+        // After the waves of the press.
+        for step in [150, 200, 300, 500, 999] {
+            let truth = 1.0 + left(&branches, 0.05, 1e-3 * (step + 1) as f64);
+            let ratio = relaxing_n[step] / elastic_n[999] / truth;
+            println!(
+                "{scheme}, {step} ms: {:.4} N, {ratio:.4} of theory, {truth:.3} of the elastic one",
+                relaxing_n[step]
+            );
+            assert!((ratio - 1.0).abs() < 0.02, "{scheme} {step}: {ratio}");
+        }
+    }
+}
+
+#[test]
+fn a_held_force_creeps_to_the_place_that_it_has_without_branches() {
+    let (stiffness, time_s) = (1.0, 0.1);
+    let moved_m = |branches: &[(f64, f64)]| -> Vec<f64> {
+        let mut tissue = at_rest(&relaxing(branches, &[]));
+        push(&mut *tissue, DVec3::new(0.0, 0.0, -0.02));
+        let moved_m = |_| {
+            tissue.step().unwrap();
+            tissue.surface_displacement_m(DVec3::new(0.03, 0.03, 0.03)).z
+        };
+        (0..1000).map(moved_m).collect()
+    };
+    let (elastic_m, creeping_m) = (moved_m(&[]), moved_m(&[(stiffness, time_s)]));
+    for step in [150, 300, 600, 999] {
+        // The strain of J(t) = 1 − γ/(1 + γ)·e^(−t/((1 + γ)τ)).
+        let truth =
+            1.0 - stiffness / (1.0 + stiffness) * (-1e-3 * (step + 1) as f64 / ((1.0 + stiffness) * time_s)).exp();
+        let ratio = creeping_m[step] / elastic_m[999] / truth;
+        println!("{step} ms: {ratio:.4} of theory");
+        assert!((ratio - 1.0).abs() < 0.02, "{step}: {ratio}");
+    }
+}
+
+/// Fast presses and jumps: what branches give back is no energy from nowhere to the guard, and a released solid comes to rest.
+#[test]
+fn branches_give_back_what_they_stored_and_no_more() {
+    for branches in [vec![(2.0, 0.003)], vec![(0.5, 0.05), (3.0, 0.1)], vec![(1.0, 0.3)]] {
+        let hash = |lanes: &str| {
+            let sets = [
+                format!("stepping.lanes=\"{lanes}\""),
+                "stepping.integrator=\"auto\"".to_owned(),
+                "stepping.substeps=\"auto\"".to_owned(),
+            ];
+            let model = relaxing(&branches, &sets.each_ref().map(String::as_str));
+            assert_eq!(model.plan.integrator.name(), "stormer");
+            let mut tissue = at_rest(&model);
+            let mut hash = None;
+            for step in 0..10_000 {
+                match step {
+                    0..600 => {
+                        // In and out within 40 ms, 5 mm deep, then a jump, then a grasp that moves.
+                        let depth_m = 0.0025 * (1.0 - (f64::from(step) * std::f64::consts::TAU / 40.0).cos());
+                        tissue.pose(0, DVec3::new(0.03, 0.03, 0.03 - depth_m), Tip::default());
+                    }
+                    600 => {
+                        tissue.release(0);
+                        push(&mut *tissue, DVec3::new(0.05, 0.0, -0.1));
+                    }
+                    800 => {
+                        tissue.release(0);
+                        let point = model.shape().nearest(DVec3::new(0.03, 0.02, 0.03));
+                        tissue.grasp(1, point, palpate_tissue::Grasp::Target(DVec3::new(0.002, 0.0, 0.003)));
+                    }
+                    900 => tissue.release(1),
+                    1000 => hash = Some(tissue.state_hash()),
+                    _ => {}
+                }
+                tissue.step().unwrap();
+            }
+            assert_eq!(tissue.guard_events(), 0, "{branches:?}");
+            assert_eq!(tissue.awake_points(), 0, "{branches:?}: {} m", tissue.largest_displacement_m());
+            hash.unwrap()
+        };
+        assert_eq!(hash("plain"), hash("auto"), "{branches:?}");
+    }
+}
+
+#[test]
+fn a_relaxing_solid_continues_from_a_snapshot_with_the_same_bits_and_is_told_whole() {
+    let model = relaxing(
+        &[(1.0, 0.1), (0.5, 1.0)],
+        &["stepping.integrator=\"stormer\"", "gravity.acceleration_m_per_s2=[0, 0, -9.81]"],
+    );
+    let mut tissue = at_rest(&model);
+    let press = |tissue: &mut dyn Tissue, steps: u32| {
+        for _ in 0..steps {
+            tissue.pose(0, DVec3::new(0.03, 0.03, 0.029), Tip::default());
+            tissue.step().unwrap();
+        }
+    };
+    press(&mut *tissue, 300);
+    let PlainTissue { parts, values } = tissue.save().plain();
+    let mut continued = palpate_tissue::restored(&model, &parts, &values, &Limits::default()).unwrap();
+    [&mut tissue, &mut continued].into_iter().for_each(|tissue| press(&mut **tissue, 100));
+    assert_eq!(tissue.state_hash(), continued.state_hash());
+    // A scene that is sent has the same branches.
+    let Body::Solid(solid) = &model.scene.body else { panic!() };
+    let message = palpate_session::wire::scene::scene(&model.scene);
+    let told = palpate_session::wire::scene::from_told(&message, solid.shape.source()).unwrap();
+    let Body::Solid(told) = &told.body else { panic!() };
+    assert_eq!((told.material.branches, told.material.branches.iter().count()), (solid.material.branches, 2));
+}
+
+#[test]
+fn branches_that_no_solid_can_have_are_refused_with_their_place() {
+    let refused = |branches: &str, sets: &[&str]| {
+        let refusal = read(&(block_text("cell_m = 0.01") + branches), sets).unwrap_err();
+        (refusal.reason, refusal.field)
+    };
+    let of = |reason, field: &str| (reason, field.to_owned());
+    let one = "[[branch]]\nshear_modulus_pa = 1000\ntime_s = 0.1\n";
+    assert_eq!(refused(&one.repeat(4), &[]), of(Reason::TooLarge, "branch"));
+    let bad = |from: &str, to: &str| refused(&(one.to_owned() + &one.replace(from, to)), &[]);
+    assert_eq!(bad("1000", "-1"), of(Reason::OutOfRange, "branch[1].shear_modulus_pa"));
+    assert_eq!(bad("0.1", "1e-5"), of(Reason::OutOfRange, "branch[1].time_s"));
+    assert_eq!(bad("time_s = 0.1", ""), of(Reason::Missing, "branch[1].time_s"));
+    for scheme in ["rk4", "exponential2", "exponential4"] {
+        let set = format!("stepping.integrator=\"{scheme}\"");
+        assert_eq!(refused(one, &[&set]), of(Reason::WrongKind, "stepping.integrator"));
+    }
+    let sheet = format!("{}{one}", palpate_tissue::scene::PAPER);
+    assert_eq!(read(&sheet, &[]).map_err(|refusal| refusal.field).unwrap_err(), "branch");
 }
 
 type StillPress = fn(&mut dyn Tissue);
@@ -650,12 +816,11 @@ fn a_tool_keeps_the_shape_of_its_tip_until_it_is_released() {
 }
 
 /// Doubled and turned triangles, triangles on an edge of two others, and a second block that crosses the first.
-#[test]
-fn triangles_that_form_no_surface_are_filled_as_if_they_did() {
-    let mesh = |name: &str| {
-        palpate_geometry::read(name, &bytes(name), "mm".parse().unwrap(), &|_| None, &ReadLimits::default())
-    };
-    let whole = mesh("block.obj").unwrap().mesh;
+/// The block and half of it, which cross, with triangles that are doubled, turned and in the way.
+fn crossing_blocks() -> palpate_geometry::TriangleMesh {
+    let name = "block.obj";
+    let limits = ReadLimits::default();
+    let whole = palpate_geometry::read(name, &bytes(name), "mm".parse().unwrap(), &|_| None, &limits).unwrap().mesh;
     let mut bad = whole.clone();
     let first = bad.triangles[0];
     bad.triangles.push(first);
@@ -664,16 +829,135 @@ fn triangles_that_form_no_surface_are_filled_as_if_they_did() {
     let corners = bad.vertices_m.len() as u32;
     bad.vertices_m.extend(whole.vertices_m.iter().map(|at| *at * 0.5 + DVec3::new(0.041, 0.013, 0.007)));
     bad.triangles.extend(whole.triangles.iter().map(|triangle| triangle.map(|corner| corner + corners)));
+    bad
+}
+
+#[test]
+fn triangles_that_form_no_surface_are_filled_as_if_they_did() {
     let fixed = FixedPart::Plane { plane_m: DVec3::ZERO, normal: DVec3::Z, within_m: 0.0 };
     let of =
         |mesh| Solid::of(mesh, CellSize::Edge(0.004), std::slice::from_ref(&fixed), SolidMaterial::usual()).unwrap();
-    let solid = of(bad);
+    let solid = of(crossing_blocks());
     let volume_m3 =
         |solid: &Solid| solid.shape.parts().iter().map(|part| f64::from(*part)).sum::<f64>() * 0.004_f64.powi(3);
     // Of the second block, x from 60 to 71 mm is outside of the first.
     let expected = 0.06 * 0.06 * 0.03 + 0.011 * 0.03 * 0.015;
     assert!((volume_m3(&solid) / expected - 1.0).abs() < 0.02, "{} {expected}", volume_m3(&solid));
     assert!(solid.shape.surface().vertices_m().len() > 100);
+}
+
+/// A block of 4 × 4 × 4 hexahedra of 10 mm, the eight in the middle of region 7, in three formats; a third of the elements are
+/// mirror images.
+fn with_a_region() -> [(&'static str, String); 3] {
+    let node = |[x, y, z]: [usize; 3]| x + 5 * (y + 5 * z);
+    let points: Vec<[usize; 3]> = (0..125).map(|n| [n % 5, n / 5 % 5, n / 25]).collect();
+    let cells: Vec<[usize; 3]> = (0..64).map(|n| [n % 4, n / 4 % 4, n / 16]).collect();
+    let corners = |(number, [x, y, z]): (usize, [usize; 3])| {
+        let below = |z: usize| [[x, y, z], [x + 1, y, z], [x + 1, y + 1, z], [x, y + 1, z]].map(node);
+        let [low, high] = if number % 3 == 0 { [z + 1, z] } else { [z, z + 1] };
+        [below(low), below(high)].concat()
+    };
+    let hexes: Vec<Vec<usize>> = cells.iter().copied().enumerate().map(corners).collect();
+    let tags: Vec<usize> =
+        cells.iter().map(|cell| if cell.iter().all(|c| (1..3).contains(c)) { 7 } else { 1 }).collect();
+    let words = |numbers: &[usize]| numbers.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
+    let places: Vec<String> = points.iter().map(|of| words(&of.map(|c| 10 * c))).collect();
+    let nodes: Vec<String> = (1..).zip(&places).map(|(n, place)| format!("{n} {place}")).collect();
+    let of_hex = |(n, (hex, tag)): (usize, (&Vec<usize>, &usize))| {
+        format!("{n} 5 2 {tag} {tag} {}", words(&hex.iter().map(|node| node + 1).collect::<Vec<_>>()))
+    };
+    let elements: Vec<String> = (1..).zip(hexes.iter().zip(&tags)).map(of_hex).collect();
+    let msh = format!(
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n2\n3 1 \"tissue\"\n3 7 \"lump\"\n$EndPhysicalNames\n\
+         $Nodes\n125\n{}\n$EndNodes\n$Elements\n64\n{}\n$EndElements\n",
+        nodes.join("\n"),
+        elements.join("\n")
+    );
+    let lists: Vec<String> = hexes.iter().map(|hex| format!("8 {}", words(hex))).collect();
+    let vtk = format!(
+        "# vtk DataFile Version 3.0\nblock\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 125 float\n{}\nCELLS 64 576\n{}\n\
+         CELL_TYPES 64\n{}\nPOINT_DATA 125\nSCALARS height float 1\nLOOKUP_TABLE default\n{}\nCELL_DATA 64\n\
+         SCALARS material int\nLOOKUP_TABLE default\n{}\n",
+        places.join("\n"),
+        lists.join("\n"),
+        words(&[12; 64]),
+        words(&[3; 125]),
+        words(&tags)
+    );
+    let array = |name: &str, kind: &str, values: String| {
+        format!("<DataArray type=\"{kind}\" Name=\"{name}\" format=\"ascii\">{values}</DataArray>")
+    };
+    let vtu = format!(
+        "<VTKFile type=\"UnstructuredGrid\"><UnstructuredGrid><Piece NumberOfPoints=\"125\" NumberOfCells=\"64\"><CellData>{}{}\
+         </CellData><Points><DataArray type=\"Float32\" NumberOfComponents=\"3\" format=\"ascii\">{}</DataArray></Points>\
+         <Cells>{}{}{}</Cells></Piece></UnstructuredGrid></VTKFile>",
+        array("quality", "Float64", words(&[1; 64])),
+        array("region", "Int32", words(&tags)),
+        places.join(" "),
+        array("connectivity", "Int32", words(&hexes.concat())),
+        array("offsets", "Int32", words(&(1..=64).map(|n| 8 * n).collect::<Vec<_>>())),
+        array("types", "UInt8", words(&[12; 64])),
+    );
+    [("lump", msh), ("material 7", vtk), ("region 7", vtu)]
+}
+
+#[test]
+fn regions_of_volume_elements_tell_the_material() {
+    for ((name, text), ending) in with_a_region().into_iter().zip(["msh", "vtk", "vtu"]) {
+        let file = format!("block.{ending}");
+        let scene = |inclusion: &str, cell_m: &str| {
+            let of_block = format!(
+                "[solid]\nfile = \"{file}\"\nunit = \"mm\"\ncell_m = {cell_m}\nfixed = [{{ plane_m = [0, 0, 0], normal = [0, 0, 1] }}]\n\
+                 [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = 0.45\n[[inclusion]]\nstiffness_factor = 5\n{inclusion}\n"
+            );
+            Scene::parse_given("block", &of_block, (&file, text.as_bytes()), &Limits::default())
+        };
+        let region = |cell_m: &str| scene(&format!("group = \"{name}\""), cell_m).unwrap();
+        let Body::Solid(aligned) = region("0.005").body else { panic!() };
+        let count = |factor: f64| aligned.weights().iter().filter(|weight| (*weight - factor).abs() < 1e-6).count();
+        assert_eq!((count(5.0), count(1.0)), (64, 448), "{ending}");
+        // Cells across its faces have the power of their part.
+        let Body::Solid(coarse) = region("0.008").body else { panic!() };
+        let (sum, within) = coarse.weights().iter().fold((0.0, 0.0), |(sum, within), weight| {
+            (sum + weight.max(1e-9).ln().max(0.0) / 5_f64.ln(), within + f64::from(u8::from(*weight > 1.0)))
+        });
+        assert!(within > 8.0 && (sum * 0.512 / 8.0 - 1.0).abs() < 0.02, "{ending}: {sum} of {within}");
+        let refused = |inclusion: &str| scene(inclusion, "0.005").unwrap_err();
+        let unknown = refused("group = \"lumps\"");
+        assert_eq!(unknown.field, "inclusion[0].group", "{unknown}");
+        assert!(unknown.message.contains(name), "{unknown}");
+        assert_eq!(refused(&format!("group = \"{name}\"\nedge_m = 0.001")).field, "inclusion[0].edge_m");
+    }
+    let block =
+        read(&block_text("cell_m = 0.01\n[[inclusion]]\ngroup = \"lump\"\nstiffness_factor = 5"), &[]).unwrap_err();
+    assert_eq!(block.field, "inclusion[0].group");
+}
+
+/// A solid that a journal kept is the same again, also one whose triangles form no surface.
+#[test]
+fn a_journal_keeps_regions_and_triangles_that_form_no_surface() {
+    let limits = Limits::default();
+    let (name, text) = &with_a_region()[0];
+    let of_region = format!(
+        "[solid]\nfile = \"block.msh\"\nunit = \"mm\"\ncell_m = 0.01\nfixed = [{{ plane_m = [0, 0, 0], normal = [0, 0, 1] }}]\n\
+         [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = 0.45\n[[inclusion]]\nstiffness_factor = 5\ngroup = \"{name}\"\n"
+    );
+    let of_region = Scene::parse_given("block", &of_region, ("block.msh", text.as_bytes()), &limits).unwrap();
+    let crossing = crossing_blocks();
+    let vertices: String =
+        crossing.vertices_m.iter().map(|at| format!("v {} {} {}\n", 1e3 * at.x, 1e3 * at.y, 1e3 * at.z)).collect();
+    let faces: String =
+        crossing.triangles.iter().map(|[a, b, c]| format!("f {} {} {}\n", a + 1, b + 1, c + 1)).collect();
+    let (text, obj) = (block_text("cell_m = 0.01"), vertices + &faces);
+    let of_triangles = Scene::parse_given("block", &text, ("block.obj", obj.as_bytes()), &limits).unwrap();
+    for scene in [of_region, of_triangles] {
+        let model = Model::compile(&scene, &limits).unwrap();
+        let writer = JournalWriter::new(&journal_opening::opening(&model), 0);
+        let file = writer.finish(pb::Why::Cut, "", 0, 0);
+        let reader = JournalReader::new("journal", std::io::Cursor::new(file)).unwrap();
+        let again = palpate_session::journal::message::model(reader.header(), &limits).unwrap();
+        assert_eq!(again.fingerprint(), model.fingerprint());
+    }
 }
 
 fn bytes(name: &str) -> Vec<u8> {

@@ -234,6 +234,7 @@ fn tetrahedron() -> &'static TriangleMesh {
         triangles: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
         uv: None,
         groups: vec![Group { name: "base".into(), vertices: vec![0, 1, 2] }],
+        regions: Vec::new(),
     })
 }
 

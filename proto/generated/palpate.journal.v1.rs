@@ -678,6 +678,9 @@ pub struct TriangleMesh {
     /// Named groups of vertices.
     #[prost(message, repeated, tag = "4")]
     pub groups: ::prost::alloc::vec::Vec<Group>,
+    /// Named parts of the inside.
+    #[prost(message, repeated, tag = "5")]
+    pub regions: ::prost::alloc::vec::Vec<VolumeRegion>,
 }
 impl ::prost::Name for TriangleMesh {
     const NAME: &'static str = "TriangleMesh";
@@ -687,6 +690,29 @@ impl ::prost::Name for TriangleMesh {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.TriangleMesh".into()
+    }
+}
+/// A named part of the inside of a mesh: the surface around it.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct VolumeRegion {
+    /// The name.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// Positions of the vertices: x, y and z of each, m.
+    #[prost(double, repeated, tag = "2")]
+    pub vertices_m: ::prost::alloc::vec::Vec<f64>,
+    /// Three vertex indices per triangle, counterclockwise seen from outside the region.
+    #[prost(uint32, repeated, tag = "3")]
+    pub triangles: ::prost::alloc::vec::Vec<u32>,
+}
+impl ::prost::Name for VolumeRegion {
+    const NAME: &'static str = "VolumeRegion";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.VolumeRegion".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.VolumeRegion".into()
     }
 }
 /// A named group of vertices.

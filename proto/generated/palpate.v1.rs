@@ -2566,6 +2566,9 @@ pub struct Solid {
     /// displacement (Winkler), N/m³; 0 or more. Viscosity acts on it as on the tissue. 0 if absent.
     #[prost(double, optional, tag = "11")]
     pub foundation_n_per_m3: ::core::option::Option<f64>,
+    /// Parts of the stiffness that relax, beside E (a Prony series). At most 3.
+    #[prost(message, repeated, tag = "12")]
+    pub branches: ::prost::alloc::vec::Vec<Branch>,
 }
 impl ::prost::Name for Solid {
     const NAME: &'static str = "Solid";
@@ -2575,6 +2578,26 @@ impl ::prost::Name for Solid {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Solid".into()
+    }
+}
+/// A part of a solid's stiffness that relaxes: a spring and a damper in series, beside the elastic law.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Branch {
+    /// G of the branch, Pa; above 0. It has the elastic law, times this divided by the shear modulus of E. Required.
+    #[prost(double, optional, tag = "1")]
+    pub shear_modulus_pa: ::core::option::Option<f64>,
+    /// The time in which its stress falls by a factor of e if nothing moves, 1e-3 to 1e4 s. Required.
+    #[prost(double, optional, tag = "2")]
+    pub time_s: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Branch {
+    const NAME: &'static str = "Branch";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Branch".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Branch".into()
     }
 }
 /// A layer of a solid.

@@ -358,15 +358,15 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Message(54) },
 Field { number: 8, is_list: false, kind: FieldKind::Message(55) },
 Field { number: 12, is_list: false, kind: FieldKind::Message(56) },
-Field { number: 9, is_list: false, kind: FieldKind::Message(60) },
-Field { number: 10, is_list: true, kind: FieldKind::Message(61) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(62) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(63) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(64) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(65) },
+Field { number: 9, is_list: false, kind: FieldKind::Message(61) },
+Field { number: 10, is_list: true, kind: FieldKind::Message(62) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(63) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(64) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(65) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(66) },
 Field { number: 13, is_list: false, kind: FieldKind::Message(53) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(66) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(67) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(67) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(68) },
 ] },
 Shape { name: "palpate.v1.Gravity", bytes: size_of::<crate::pb::Gravity>(), decode: |bytes| <crate::pb::Gravity as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
@@ -392,21 +392,26 @@ Shape { name: "palpate.v1.Solid", bytes: size_of::<crate::pb::Solid>(), decode: 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(58) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(59) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 9, is_list: true, kind: FieldKind::Message(57) },
+Field { number: 9, is_list: true, kind: FieldKind::Message(58) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 11, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 12, is_list: true, kind: FieldKind::Message(57) },
+] },
+Shape { name: "palpate.v1.Branch", bytes: size_of::<crate::pb::Branch>(), decode: |bytes| <crate::pb::Branch as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.Layer", bytes: size_of::<crate::pb::Layer>(), decode: |bytes| <crate::pb::Layer as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.FixedPart", bytes: size_of::<crate::pb::FixedPart>(), decode: |bytes| <crate::pb::FixedPart as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(59) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(60) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(5) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
@@ -469,7 +474,7 @@ Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.UploadMeshResponse", bytes: size_of::<crate::pb::UploadMeshResponse>(), decode: |bytes| <crate::pb::UploadMeshResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(72) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(73) },
 Field { number: 4, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.UploadJournalRequest", bytes: size_of::<crate::pb::UploadJournalRequest>(), decode: |bytes| <crate::pb::UploadJournalRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -481,7 +486,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.UploadJournalResponse", bytes: size_of::<crate::pb::UploadJournalResponse>(), decode: |bytes| <crate::pb::UploadJournalResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(117) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(118) },
 ] },
 Shape { name: "palpate.v1.MeshReport", bytes: size_of::<crate::pb::MeshReport>(), decode: |bytes| <crate::pb::MeshReport as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -491,7 +496,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Message(8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 8, is_list: true, kind: FieldKind::Message(73) },
+Field { number: 8, is_list: true, kind: FieldKind::Message(74) },
 Field { number: 9, is_list: true, kind: FieldKind::Text },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
@@ -509,7 +514,7 @@ Field { number: 1, is_list: true, kind: FieldKind::Text },
 Shape { name: "palpate.v1.CreateSessionRequest", bytes: size_of::<crate::pb::CreateSessionRequest>(), decode: |bytes| <crate::pb::CreateSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Message(52) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(77) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(78) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
@@ -522,7 +527,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.CreateSessionResponse", bytes: size_of::<crate::pb::CreateSessionResponse>(), decode: |bytes| <crate::pb::CreateSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(79) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(80) },
 ] },
 Shape { name: "palpate.v1.Session", bytes: size_of::<crate::pb::Session>(), decode: |bytes| <crate::pb::Session as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -537,7 +542,7 @@ Field { number: 9, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 11, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Text },
-Field { number: 13, is_list: true, kind: FieldKind::Message(92) },
+Field { number: 13, is_list: true, kind: FieldKind::Message(93) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 15, is_list: true, kind: FieldKind::Text },
 Field { number: 16, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -549,17 +554,17 @@ Field { number: 21, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 22, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 23, is_list: false, kind: FieldKind::Text },
 Field { number: 24, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 25, is_list: false, kind: FieldKind::Message(91) },
-Field { number: 26, is_list: false, kind: FieldKind::Message(88) },
+Field { number: 25, is_list: false, kind: FieldKind::Message(92) },
+Field { number: 26, is_list: false, kind: FieldKind::Message(89) },
 Field { number: 27, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 28, is_list: true, kind: FieldKind::Message(87) },
+Field { number: 28, is_list: true, kind: FieldKind::Message(88) },
 Field { number: 29, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 30, is_list: false, kind: FieldKind::Message(8) },
-Field { number: 31, is_list: false, kind: FieldKind::Message(86) },
-Field { number: 32, is_list: false, kind: FieldKind::Message(85) },
-Field { number: 33, is_list: false, kind: FieldKind::Message(82) },
-Field { number: 34, is_list: true, kind: FieldKind::Message(81) },
-Field { number: 35, is_list: false, kind: FieldKind::Message(80) },
+Field { number: 31, is_list: false, kind: FieldKind::Message(87) },
+Field { number: 32, is_list: false, kind: FieldKind::Message(86) },
+Field { number: 33, is_list: false, kind: FieldKind::Message(83) },
+Field { number: 34, is_list: true, kind: FieldKind::Message(82) },
+Field { number: 35, is_list: false, kind: FieldKind::Message(81) },
 ] },
 Shape { name: "palpate.v1.MeshErrorEstimate", bytes: size_of::<crate::pb::MeshErrorEstimate>(), decode: |bytes| <crate::pb::MeshErrorEstimate as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -582,7 +587,7 @@ Shape { name: "palpate.v1.LocateSessionRequest", bytes: size_of::<crate::pb::Loc
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.LocateSessionResponse", bytes: size_of::<crate::pb::LocateSessionResponse>(), decode: |bytes| <crate::pb::LocateSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(82) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(83) },
 ] },
 Shape { name: "palpate.v1.Playback", bytes: size_of::<crate::pb::Playback>(), decode: |bytes| <crate::pb::Playback as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -609,12 +614,12 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 Shape { name: "palpate.v1.Audit", bytes: size_of::<crate::pb::Audit>(), decode: |bytes| <crate::pb::Audit as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(89) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(89) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(90) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(90) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(90) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(91) },
 Field { number: 9, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.AuditedError", bytes: size_of::<crate::pb::AuditedError>(), decode: |bytes| <crate::pb::AuditedError as Message>::decode(bytes).is_ok(), fields: &[
@@ -623,7 +628,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.Correction", bytes: size_of::<crate::pb::Correction>(), decode: |bytes| <crate::pb::Correction as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(89) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(90) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Text },
 Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -646,12 +651,12 @@ Shape { name: "palpate.v1.GetSessionRequest", bytes: size_of::<crate::pb::GetSes
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.GetSessionResponse", bytes: size_of::<crate::pb::GetSessionResponse>(), decode: |bytes| <crate::pb::GetSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(79) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(80) },
 ] },
 Shape { name: "palpate.v1.ListSessionsRequest", bytes: size_of::<crate::pb::ListSessionsRequest>(), decode: |bytes| <crate::pb::ListSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListSessionsResponse", bytes: size_of::<crate::pb::ListSessionsResponse>(), decode: |bytes| <crate::pb::ListSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(79) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(80) },
 ] },
 Shape { name: "palpate.v1.DeleteSessionRequest", bytes: size_of::<crate::pb::DeleteSessionRequest>(), decode: |bytes| <crate::pb::DeleteSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -682,7 +687,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.UpdateTissueResponse", bytes: size_of::<crate::pb::UpdateTissueResponse>(), decode: |bytes| <crate::pb::UpdateTissueResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(79) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(80) },
 ] },
 Shape { name: "palpate.v1.PauseSessionRequest", bytes: size_of::<crate::pb::PauseSessionRequest>(), decode: |bytes| <crate::pb::PauseSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -717,7 +722,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListJournalsRequest", bytes: size_of::<crate::pb::ListJournalsRequest>(), decode: |bytes| <crate::pb::ListJournalsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListJournalsResponse", bytes: size_of::<crate::pb::ListJournalsResponse>(), decode: |bytes| <crate::pb::ListJournalsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(115) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(116) },
 ] },
 Shape { name: "palpate.v1.JournalInfo", bytes: size_of::<crate::pb::JournalInfo>(), decode: |bytes| <crate::pb::JournalInfo as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -735,11 +740,11 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.GetJournalResponse", bytes: size_of::<crate::pb::GetJournalResponse>(), decode: |bytes| <crate::pb::GetJournalResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(115) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(116) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(118) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(119) },
 Field { number: 6, is_list: true, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.ForceMoment", bytes: size_of::<crate::pb::ForceMoment>(), decode: |bytes| <crate::pb::ForceMoment as Message>::decode(bytes).is_ok(), fields: &[
@@ -765,7 +770,7 @@ Field { number: 5, is_list: true, kind: FieldKind::Number(4, 4) },
 Field { number: 6, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: true, kind: FieldKind::Number(4, 0) },
-Field { number: 9, is_list: true, kind: FieldKind::Message(123) },
+Field { number: 9, is_list: true, kind: FieldKind::Message(124) },
 ] },
 Shape { name: "palpate.v1.VertexGroup", bytes: size_of::<crate::pb::VertexGroup>(), decode: |bytes| <crate::pb::VertexGroup as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -803,7 +808,7 @@ Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 13, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 15, is_list: true, kind: FieldKind::Message(128) },
+Field { number: 15, is_list: true, kind: FieldKind::Message(129) },
 Field { number: 16, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.Patch", bytes: size_of::<crate::pb::Patch>(), decode: |bytes| <crate::pb::Patch as Message>::decode(bytes).is_ok(), fields: &[
@@ -822,7 +827,7 @@ Shape { name: "palpate.v1.AcknowledgeFramesResponse", bytes: size_of::<crate::pb
 Shape { name: "palpate.v1.ListNodesRequest", bytes: size_of::<crate::pb::ListNodesRequest>(), decode: |bytes| <crate::pb::ListNodesRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListNodesResponse", bytes: size_of::<crate::pb::ListNodesResponse>(), decode: |bytes| <crate::pb::ListNodesResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(133) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(134) },
 ] },
 Shape { name: "palpate.v1.Node", bytes: size_of::<crate::pb::Node>(), decode: |bytes| <crate::pb::Node as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -837,11 +842,11 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListFleetSessionsRequest", bytes: size_of::<crate::pb::ListFleetSessionsRequest>(), decode: |bytes| <crate::pb::ListFleetSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListFleetSessionsResponse", bytes: size_of::<crate::pb::ListFleetSessionsResponse>(), decode: |bytes| <crate::pb::ListFleetSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(136) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(137) },
 ] },
 Shape { name: "palpate.v1.FleetSession", bytes: size_of::<crate::pb::FleetSession>(), decode: |bytes| <crate::pb::FleetSession as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(82) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(83) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.MoveSessionRequest", bytes: size_of::<crate::pb::MoveSessionRequest>(), decode: |bytes| <crate::pb::MoveSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -849,7 +854,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MoveSessionResponse", bytes: size_of::<crate::pb::MoveSessionResponse>(), decode: |bytes| <crate::pb::MoveSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(82) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(83) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.DrainNodeRequest", bytes: size_of::<crate::pb::DrainNodeRequest>(), decode: |bytes| <crate::pb::DrainNodeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -864,7 +869,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.ListCallersRequest", bytes: size_of::<crate::pb::ListCallersRequest>(), decode: |bytes| <crate::pb::ListCallersRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListCallersResponse", bytes: size_of::<crate::pb::ListCallersResponse>(), decode: |bytes| <crate::pb::ListCallersResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(143) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(144) },
 ] },
 Shape { name: "palpate.v1.CallerUse", bytes: size_of::<crate::pb::CallerUse>(), decode: |bytes| <crate::pb::CallerUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -878,7 +883,7 @@ Shape { name: "palpate.v1.ListStreamsRequest", bytes: size_of::<crate::pb::ListS
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.ListStreamsResponse", bytes: size_of::<crate::pb::ListStreamsResponse>(), decode: |bytes| <crate::pb::ListStreamsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(146) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(147) },
 ] },
 Shape { name: "palpate.v1.StreamUse", bytes: size_of::<crate::pb::StreamUse>(), decode: |bytes| <crate::pb::StreamUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
@@ -916,22 +921,22 @@ Shape { name: "palpate.v1.ReviveSessionResponse", bytes: size_of::<crate::pb::Re
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.CreateHereRequest", bytes: size_of::<crate::pb::CreateHereRequest>(), decode: |bytes| <crate::pb::CreateHereRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(76) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(77) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.CreateHereResponse", bytes: size_of::<crate::pb::CreateHereResponse>(), decode: |bytes| <crate::pb::CreateHereResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(79) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(80) },
 ] },
 Shape { name: "palpate.v1.MirrorRequest", bytes: size_of::<crate::pb::MirrorRequest>(), decode: |bytes| <crate::pb::MirrorRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(158) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(159) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(161) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(159) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(160) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(162) },
 ] },
 Shape { name: "palpate.v1.MirrorOpen", bytes: size_of::<crate::pb::MirrorOpen>(), decode: |bytes| <crate::pb::MirrorOpen as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorParts", bytes: size_of::<crate::pb::MirrorParts>(), decode: |bytes| <crate::pb::MirrorParts as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(160) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(161) },
 ] },
 Shape { name: "palpate.v1.MirrorPart", bytes: size_of::<crate::pb::MirrorPart>(), decode: |bytes| <crate::pb::MirrorPart as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -943,7 +948,7 @@ Shape { name: "palpate.v1.MirrorEnd", bytes: size_of::<crate::pb::MirrorEnd>(), 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorResponse", bytes: size_of::<crate::pb::MirrorResponse>(), decode: |bytes| <crate::pb::MirrorResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(163) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(164) },
 ] },
 Shape { name: "palpate.v1.Mirrored", bytes: size_of::<crate::pb::Mirrored>(), decode: |bytes| <crate::pb::Mirrored as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -952,13 +957,13 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.TakeSessionRequest", bytes: size_of::<crate::pb::TakeSessionRequest>(), decode: |bytes| <crate::pb::TakeSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(165) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(166) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.TakeOver", bytes: size_of::<crate::pb::TakeOver>(), decode: |bytes| <crate::pb::TakeOver as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(167) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(166) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(168) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(167) },
 ] },
 Shape { name: "palpate.v1.KnownLaw", bytes: size_of::<crate::pb::KnownLaw>(), decode: |bytes| <crate::pb::KnownLaw as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -979,17 +984,17 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(170) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(171) },
 ] },
 Shape { name: "palpate.journal.v1.Input", bytes: size_of::<crate::journal::Input>(), decode: |bytes| <crate::journal::Input as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(171) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(177) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(178) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(179) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(180) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(181) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(182) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(172) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(178) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(179) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(180) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(181) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(182) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(183) },
 ] },
 Shape { name: "palpate.journal.v1.Command", bytes: size_of::<crate::journal::Command>(), decode: |bytes| <crate::journal::Command as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1001,10 +1006,10 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(172) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(173) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(174) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(176) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(173) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(174) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(175) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(177) },
 ] },
 Shape { name: "palpate.journal.v1.Push", bytes: size_of::<crate::journal::Push>(), decode: |bytes| <crate::journal::Push as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1020,7 +1025,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
 Shape { name: "palpate.journal.v1.Pose", bytes: size_of::<crate::journal::Pose>(), decode: |bytes| <crate::journal::Pose as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(175) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(176) },
 ] },
 Shape { name: "palpate.journal.v1.Tip", bytes: size_of::<crate::journal::Tip>(), decode: |bytes| <crate::journal::Tip as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1069,23 +1074,23 @@ Shape { name: "palpate.journal.v1.Snapshot", bytes: size_of::<crate::journal::Sn
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(177) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(178) },
 Field { number: 5, is_list: false, kind: FieldKind::Text },
 Field { number: 6, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Felt", bytes: size_of::<crate::journal::Felt>(), decode: |bytes| <crate::journal::Felt as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(186) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(187) },
 ] },
 Shape { name: "palpate.journal.v1.Moment", bytes: size_of::<crate::journal::Moment>(), decode: |bytes| <crate::journal::Moment as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(187) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(188) },
 ] },
 Shape { name: "palpate.journal.v1.FeltTool", bytes: size_of::<crate::journal::FeltTool>(), decode: |bytes| <crate::journal::FeltTool as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(188) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(188) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(188) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(189) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(189) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(189) },
 ] },
 Shape { name: "palpate.journal.v1.Vector", bytes: size_of::<crate::journal::Vector>(), decode: |bytes| <crate::journal::Vector as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 4) },
@@ -1093,7 +1098,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 ] },
 Shape { name: "palpate.journal.v1.Waiting", bytes: size_of::<crate::journal::Waiting>(), decode: |bytes| <crate::journal::Waiting as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(170) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(171) },
 ] },
 Shape { name: "palpate.journal.v1.Signature", bytes: size_of::<crate::journal::Signature>(), decode: |bytes| <crate::journal::Signature as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1115,16 +1120,22 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(52) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(193) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(195) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(177) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(194) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(197) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(178) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal::TriangleMesh>(), decode: |bytes| <crate::journal::TriangleMesh as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(194) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(196) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(195) },
+] },
+Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Text },
+Field { number: 2, is_list: true, kind: FieldKind::Number(8, 8) },
+Field { number: 3, is_list: true, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Group", bytes: size_of::<crate::journal::Group>(), decode: |bytes| <crate::journal::Group as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1165,7 +1176,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(198) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(200) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1181,8 +1192,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(198) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(200) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1193,7 +1204,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1202,20 +1213,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(201) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(203) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(205) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(203) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(205) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(207) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(204) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(206) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(204) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(206) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(208) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1227,20 +1238,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(209) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(207) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(207) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(211) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(209) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(209) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(208) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(210) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(214) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(215) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(216) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1255,14 +1266,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(199) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(201) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1271,7 +1282,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1281,7 +1292,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1289,7 +1300,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1300,7 +1311,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1308,7 +1319,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(202) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

@@ -8,7 +8,7 @@ use palpate_geometry::decimate::{MIN_VERTICES, decimate};
 use palpate_geometry::repair::{Repair, SurfaceMeasure, repair};
 use palpate_geometry::report::{Finding, LISTED, MeshReport, Spread};
 use palpate_geometry::write::{Format, write};
-use palpate_geometry::{Group, MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
+use palpate_geometry::{Group, MeshError, ReadLimits, TriangleMesh, Unit, VolumeRegion, prepare, read, report};
 use palpate_refusal::printable::{printable, printable_json};
 use palpate_tissue::files;
 use serde::Serialize;
@@ -52,6 +52,7 @@ struct MeshDescription {
     report: MeshReport,
     /// Vertices with a name, which `fixed` of a scene may give.
     groups: Vec<ToldGroup>,
+    regions: Vec<ToldRegion>,
     /// Unit of the file, in which places are printed.
     #[serde(skip)]
     unit: Unit,
@@ -62,6 +63,13 @@ struct MeshDescription {
 struct ToldGroup {
     name: String,
     vertices: usize,
+}
+
+/// A part of the inside with a name.
+#[derive(Serialize)]
+struct ToldRegion {
+    name: String,
+    volume_m3: f64,
 }
 
 /// Checks a mesh; repairs and writes it if requested.
@@ -93,6 +101,11 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let (mut told, mesh) = treat(arguments, found.mesh, told);
     let group = |group: &Group| ToldGroup { name: group.name.clone(), vertices: group.vertices.len() };
     told.groups = mesh.groups.iter().map(group).collect();
+    let region = |VolumeRegion { name, vertices_m, triangles }: &VolumeRegion| ToldRegion {
+        name: name.clone(),
+        volume_m3: palpate_geometry::report::volume(vertices_m, triangles),
+    };
+    told.regions = mesh.regions.iter().map(region).collect();
     print(arguments, &told)?;
     if let Some(finding) = told.report.refusal() {
         let message = format!("{}: {}", told.file, finding.text(unit));
@@ -203,6 +216,9 @@ impl Display for MeshDescription {
         match self.groups.len().saturating_sub(GROUPS_TOLD) {
             0 => {}
             more => row("", &format!("and {more} more; --json lists all"))?,
+        }
+        for (number, ToldRegion { name, volume_m3 }) in self.regions.iter().take(GROUPS_TOLD).enumerate() {
+            row(if number == 0 { "regions" } else { "" }, &format!("{name}: {:.3} ml", volume_m3 * 1e6))?;
         }
         for (name, lines) in [("read", &self.notes), ("done", &self.done)] {
             for line in lines {

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use palpate_geometry::prepare::prepare;
 use palpate_geometry::repair::{Repair, repair};
 use palpate_geometry::report::{Border, Finding};
-use palpate_geometry::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
+use palpate_geometry::{Element, MeshError, ReadLimits, TriangleMesh, Unit, VolumeRegion};
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, scene};
 
@@ -201,7 +201,11 @@ impl UploadReading {
 fn bytes_of(mesh: &TriangleMesh) -> u64 {
     let groups: usize = mesh.groups.iter().map(|group| group.name.len() + size_of_val(group.vertices.as_slice())).sum();
     let uv = mesh.uv.as_deref().map_or(0, size_of_val);
-    (size_of_val(mesh.vertices_m.as_slice()) + size_of_val(mesh.triangles.as_slice()) + uv + groups) as u64
+    let of_region = |region: &VolumeRegion| {
+        region.name.len() + size_of_val(region.vertices_m.as_slice()) + size_of_val(region.triangles.as_slice())
+    };
+    let regions: usize = mesh.regions.iter().map(of_region).sum();
+    (size_of_val(mesh.vertices_m.as_slice()) + size_of_val(mesh.triangles.as_slice()) + uv + groups + regions) as u64
 }
 
 /// Returns an entry of the report that says what was done with a mesh.

@@ -192,6 +192,18 @@ pub fn solid_case(seed: u64) -> RandomScene {
         1 => None,
         _ => Some(1e-3 * turn_by_viscosity / turn * 0.5 * youngs_pa / (1.0 + poissons_ratio)),
     };
+    // One in seven has one to three branches.
+    let branches = if seed % 7 == 5 {
+        let mut random = fastrand::Rng::with_seed(seed ^ 0x_6272_616e_6368);
+        let branch = |_| {
+            let (of_shear, time_s) = (0.05 * 40_f64.powf(random.f64()), 3e-3 * 1e3_f64.powf(random.f64()));
+            let shear_modulus_pa = of_shear * 0.5 * youngs_pa / (1.0 + poissons_ratio);
+            format!("[[branch]]\nshear_modulus_pa = {shear_modulus_pa:?}\ntime_s = {time_s:?}\n")
+        };
+        (0..1 + seed / 7 % 3).map(branch).collect()
+    } else {
+        String::new()
+    };
     let viscosity = viscosity_pa_s.map_or(String::new(), |value| format!("viscosity_pa_s = {value:?}\n"));
     RandomScene {
         mesh: Some(mesh.obj()),
@@ -199,13 +211,14 @@ pub fn solid_case(seed: u64) -> RandomScene {
             "name = \"random {seed}\"\n[solid]\nfile = \"mesh.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
              fixed = [{{ plane_m = [0, 0, {plane_m:?}], normal = [0, 0, 1], within_m = {:?} }}]\n\
              [material]\nyoungs_modulus_pa = {youngs_pa:?}\npoissons_ratio = {poissons_ratio:?}\n\
-             damping_per_s = {damping_per_s:?}\n{viscosity}{lump}",
+             damping_per_s = {damping_per_s:?}\n{viscosity}{branches}{lump}",
             0.2 * z.1
         ),
         about: format!(
             "solid of seed {seed}: about {cells} cells of {:.2} mm, ω·1 ms {turn:.2}, ν {poissons_ratio:.3}, damping \
-             {damping_per_s:.1}, strain {strain:.2}, falloff {falloff:.2} a cell, {}{}",
+             {damping_per_s:.1}, strain {strain:.2}, falloff {falloff:.2} a cell, {}{}{}",
             1e3 * cell_m,
+            if branches.is_empty() { "" } else { "branches, " },
             if lump.is_empty() { String::new() } else { format!("lump × {factor:.2}, ") },
             profile.replace("type = ", "")
         ),

@@ -29,7 +29,7 @@ mod winding;
 pub mod work;
 pub mod write;
 
-pub use mesh::{Group, TriangleMesh};
+pub use mesh::{Group, TriangleMesh, VolumeRegion};
 pub use prepare::{FileMesh, Prepared, prepare};
 pub use problem::{Element, MeshError, Problem};
 pub use read::{ReadLimits, ReadMesh, read, read_paid};

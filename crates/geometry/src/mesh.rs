@@ -16,6 +16,8 @@ pub struct TriangleMesh {
     pub uv: Option<Vec<[[f32; 2]; 3]>>,
     /// Named sets of vertices: groups, objects, materials or physical names of the file. A vertex may be in several.
     pub groups: Vec<Group>,
+    /// Named parts of the inside, of a file with volume elements. They may overlap.
+    pub regions: Vec<VolumeRegion>,
 }
 
 impl TriangleMesh {
@@ -48,6 +50,17 @@ impl TriangleMesh {
             triangle.iter().zip(corners).for_each(|(vertex, uv)| into[*vertex as usize] = *uv);
         }
     }
+}
+
+/// A named part of the inside of a mesh: the surface around its volume elements.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct VolumeRegion {
+    /// Name of the part in the file.
+    pub name: String,
+    /// Positions of the vertices, m.
+    pub vertices_m: Vec<DVec3>,
+    /// Three vertex indices per triangle, from 0, counterclockwise seen from outside the region.
+    pub triangles: Vec<[u32; 3]>,
 }
 
 /// A named set of vertices of a mesh, which may overlap other sets.

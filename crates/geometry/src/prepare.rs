@@ -181,6 +181,7 @@ fn simulated(file: &TriangleMesh, vertex_of: &[Option<u32>], least: &[u32]) -> T
         triangles: file.triangles.iter().map(|triangle| triangle.map(|vertex| new(vertex).unwrap_or(0))).collect(),
         uv: file.uv.clone(),
         groups: file.groups.iter().map(group).collect(),
+        regions: file.regions.clone(),
     }
 }
 

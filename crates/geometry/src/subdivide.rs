@@ -102,7 +102,7 @@ mod tests {
         let uv =
             Some(triangles.iter().map(|triangle: &[u32; 3]| triangle.map(|vertex| [vertex as f32, 1.0])).collect());
         let groups = vec![Group { name: "side".to_owned(), vertices: vec![0, 1] }];
-        let mut mesh = TriangleMesh { vertices_m, triangles, uv, groups };
+        let mut mesh = TriangleMesh { vertices_m, triangles, uv, groups, regions: Vec::new() };
         let area = |mesh: &TriangleMesh| -> f64 {
             let of = |triangle: &[u32; 3]| {
                 let [a, b, c] = triangle.map(|vertex| mesh.vertices_m[vertex as usize]);

@@ -173,6 +173,16 @@ impl fmt::Display for CheckReport {
                 scheme_selection::LASTING_S
             )?;
         }
+        if sheet.relaxes() {
+            let branches = || sheet.branches.iter().filter(|branch| branch.stiffness > 0.0);
+            let at_once = 1.0 + branches().map(|branch| branch.stiffness).sum::<f64>();
+            let times: Vec<String> = branches().map(|branch| format!("{} s", branch.time_s)).collect();
+            writeln!(
+                f,
+                "branches      {at_once:.3} times as stiff at once; what they hold falls by e in {}",
+                times.join(", ")
+            )?;
+        }
         let times = if plan.substeps == 1 { "once" } else { "times" };
         let count = if plan.substeps == 1 { String::new() } else { format!("{} ", plan.substeps) };
         writeln!(

@@ -264,6 +264,7 @@ pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Res
         uv: Some(mesh.triangles.iter().map(|t| (shape.chart)(t.map(|v| mesh.places[v as usize]))).collect()),
         vertices_m: mesh.places.iter().map(|&place| place * 1e-3).collect(),
         triangles: mesh.triangles,
+        regions: Vec::new(),
     })
 }
 

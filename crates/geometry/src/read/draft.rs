@@ -9,10 +9,13 @@ use super::polygon::{Split, triangles};
 use super::volume::{Cell, Volume};
 use super::{ReadLimits, ReadMesh};
 use crate::topology::Topology;
-use crate::{Element, Group, MeshError, Problem, TriangleMesh, Unit};
+use crate::{Element, Group, MeshError, Problem, TriangleMesh, Unit, VolumeRegion};
 
 /// Maximum number of groups in a file.
 const GROUPS: usize = 4096;
+
+/// Maximum number of regions of a file that are kept.
+const REGIONS: usize = 256;
 
 /// Marks a vertex that is dropped.
 const NONE: u32 = u32::MAX;
@@ -50,6 +53,9 @@ pub(super) struct Draft<'l> {
     /// Number of comparisons left.
     comparisons: u64,
     volume: Volume,
+    /// Volume elements and their groups.
+    cell_groups: Vec<(u32, u32)>,
+    regions: Vec<VolumeRegion>,
 }
 
 impl<'l> Draft<'l> {
@@ -72,6 +78,8 @@ impl<'l> Draft<'l> {
             folded: 0,
             comparisons: COMPARISONS,
             volume: Volume::default(),
+            cell_groups: Vec::new(),
+            regions: Vec::new(),
         }
     }
 
@@ -199,7 +207,7 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a volume element by its corners; further nodes of curved ones are ignored.
+    /// Adds a volume element by its corners, to groups of vertices and to the regions with the same names; further nodes of curved ones are ignored.
     pub(super) fn cell(&mut self, cell: Cell, nodes: &[i64], groups: &[usize]) -> Result<(), Problem> {
         if self.volume.len() >= self.limits.triangles {
             return Err(Problem::TooLarge { what: "volume elements", limit: self.limits.triangles });
@@ -210,6 +218,9 @@ impl<'l> Draft<'l> {
         self.assign(nodes, groups)?;
         self.drops_unused = true;
         let corners = nodes.iter().map(|node| self.index(*node)).collect::<Result<Vec<u32>, _>>()?;
+        for group in groups {
+            self.allowance.push(&mut self.cell_groups, (self.volume.len() as u32, *group as u32))?;
+        }
         self.volume.add(cell, &corners, &mut self.allowance)
     }
 
@@ -223,6 +234,7 @@ impl<'l> Draft<'l> {
     /// Replaces the triangles by the outer surface of the volume elements.
     fn take_outer_surface(&mut self) -> Result<(), Problem> {
         let volume = std::mem::take(&mut self.volume);
+        self.regions = self.regions_of(&volume)?;
         if !self.triangles.is_empty() {
             let number = self.triangles.len();
             self.notes
@@ -240,11 +252,49 @@ impl<'l> Draft<'l> {
             let number = surface.repeated;
             self.notes.push(format!("Volume elements left out that have the corners of an earlier one: {number}."));
         }
+        if surface.turned > 0 {
+            let number = surface.turned;
+            self.notes
+                .push(format!("Volume elements turned, whose corners are in the order of a mirror image: {number}."));
+        }
         let (cells, triangles) = (volume.len(), self.triangles.len());
         self.notes.push(format!(
             "The mesh is the outer surface of a volume. Volume elements: {cells}; triangles: {triangles}."
         ));
         Ok(())
+    }
+
+    /// Returns the regions of a volume: the surface around the elements of each group.
+    fn regions_of(&mut self, volume: &Volume) -> Result<Vec<VolumeRegion>, Problem> {
+        let mut of_cells = std::mem::take(&mut self.cell_groups);
+        of_cells.sort_unstable_by_key(|(cell, group)| (*group, *cell));
+        let mut regions = Vec::new();
+        for cells in of_cells.chunk_by(|a, b| a.1 == b.1) {
+            if regions.len() == REGIONS {
+                self.notes.push(format!("Regions beyond the first {REGIONS} are left out."));
+                break;
+            }
+            let part = volume.part(cells.iter().map(|(cell, _)| *cell), &mut self.allowance)?;
+            let faces = part.outer_surface(&self.vertices, &mut self.allowance)?.faces;
+            let mut region = VolumeRegion { name: self.groups[cells[0].1 as usize].name.clone(), ..Default::default() };
+            let mut number: BTreeMap<u32, u32> = BTreeMap::new();
+            for face in faces {
+                let corners: Vec<u32> = face
+                    .iter()
+                    .map(|vertex| {
+                        *number.entry(*vertex).or_insert_with(|| {
+                            region.vertices_m.push(self.vertices[*vertex as usize]);
+                            region.vertices_m.len() as u32 - 1
+                        })
+                    })
+                    .collect();
+                for after in 2..corners.len() {
+                    self.allowance.push(&mut region.triangles, [corners[0], corners[after - 1], corners[after]])?;
+                }
+            }
+            regions.push(region);
+        }
+        Ok(regions)
     }
 
     /// Drops triangles that repeat an earlier one with its orientation.
@@ -320,6 +370,12 @@ impl<'l> Draft<'l> {
                 return Err(fail(Element::Vertex(number), Problem::NotFinite));
             }
         }
+        for vertex_m in self.regions.iter_mut().flat_map(|region| &mut region.vertices_m) {
+            *vertex_m *= unit.metres();
+            if !vertex_m.is_finite() {
+                return Err(fail(Element::Whole, Problem::NotFinite));
+            }
+        }
         for group in &mut self.groups {
             group.vertices.sort_unstable();
             group.vertices.dedup();
@@ -344,6 +400,7 @@ impl<'l> Draft<'l> {
             triangles: self.triangles,
             uv: (self.has_uv && has_finite_uv).then_some(self.uv),
             groups: self.groups,
+            regions: self.regions,
         };
         Ok(ReadMesh { mesh, notes: self.notes })
     }

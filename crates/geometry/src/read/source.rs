@@ -35,6 +35,11 @@ impl Scalar {
         }
     }
 
+    /// Returns whether it is a type of whole numbers.
+    pub(super) fn is_integer(self) -> bool {
+        !matches!(self, Scalar::F32 | Scalar::F64)
+    }
+
     /// Returns the first `size` bytes as an unsigned number; missing bytes are 0.
     fn bits(self, bytes: &[u8], order: Order) -> u64 {
         let bytes = &bytes[..self.size().min(bytes.len())];

@@ -62,6 +62,7 @@ const SORTED: usize = 48;
 const OUTER: usize = 80;
 
 /// A volume element.
+#[derive(Clone, Copy)]
 struct VolumeElement {
     kind: Cell,
     corners: [u32; 8],
@@ -79,6 +80,8 @@ pub(super) struct OuterSurface {
     pub(super) faces: Vec<Vec<u32>>,
     /// Number of elements that were ignored because they have the corners of an earlier element.
     pub(super) repeated: usize,
+    /// Number of other elements whose corners are in the order of a mirror image.
+    pub(super) turned: usize,
 }
 
 impl Volume {
@@ -97,6 +100,19 @@ impl Volume {
         let mut own = [NONE; 8];
         own.iter_mut().zip(corners).for_each(|(own, corner)| *own = *corner);
         allowance.push(&mut self.elements, VolumeElement { kind, corners: own })
+    }
+
+    /// Returns a part of the volume: elements by their numbers.
+    pub(super) fn part(
+        &self,
+        numbers: impl Iterator<Item = u32>,
+        allowance: &mut MemoryAllowance<'_>,
+    ) -> Result<Volume, Problem> {
+        let mut part = Volume::default();
+        for number in numbers {
+            allowance.push(&mut part.elements, self.elements[number as usize])?;
+        }
+        Ok(part)
     }
 
     /// Returns for each element whether it has the corners of an earlier element.
@@ -162,7 +178,13 @@ impl Volume {
             face
         };
         let faces = outer.into_iter().map(face).collect();
-        Ok(OuterSurface { faces, repeated: is_repeated.iter().filter(|is| **is).count() })
+        let repeated = is_repeated.iter().filter(|is| **is).count();
+        // Elements of some types are all numbered the other way round in some files.
+        let is_odd = |(turned, element): (&Option<bool>, &VolumeElement)| {
+            turned.is_some_and(|turned| turned != (senses[element.kind as usize] < 0))
+        };
+        let turned = is_turned.iter().zip(&self.elements).filter(|pair| is_odd(*pair)).count();
+        Ok(OuterSurface { faces, repeated, turned })
     }
 }
 

@@ -42,6 +42,26 @@ pub(super) struct Faces {
     pub(super) grid: Cells,
     /// VTK cell types of `grid`.
     pub(super) types: Vec<i64>,
+    /// The name of an array at the cells that numbers regions, and its values.
+    pub(super) regions: Option<(String, Vec<i64>)>,
+}
+
+/// Names of arrays at cells that number regions, as programs write them: Gmsh and meshio, VMTK, TetGen and others.
+const REGIONS: [&str; 9] = [
+    "gmsh:physical",
+    "cellentityids",
+    "material",
+    "materialid",
+    "materialids",
+    "region",
+    "regionid",
+    "medit:ref",
+    "label",
+];
+
+/// Returns whether an array at cells numbers regions.
+pub(super) fn is_region(name: &str) -> bool {
+    REGIONS.iter().any(|region| name.eq_ignore_ascii_case(region))
 }
 
 impl Cells {
@@ -61,6 +81,7 @@ impl Faces {
     pub(super) fn bytes(&self) -> usize {
         let cells = [&self.polygons, &self.strips, &self.grid];
         let lists = cells.into_iter().flat_map(|cells| [&cells.connectivity, &cells.ends]).chain([&self.types]);
+        let lists = lists.chain(self.regions.iter().map(|(_, list)| list));
         lists.map(|list| size_of_val(list.as_slice())).sum()
     }
 
@@ -87,7 +108,9 @@ impl Faces {
         for ((number, list), kind) in self.grid.lists().zip(&self.types) {
             corners.clear();
             corners.extend(list.map_err(|problem| fail(number, problem))?.iter().map(|at| at.saturating_add(first)));
-            cell(*kind, &mut corners, draft).map_err(|problem| fail(number, problem))?;
+            let region =
+                cell_region(self.regions.as_ref(), *kind, number, draft).map_err(|problem| fail(number, problem))?;
+            cell(*kind, &mut corners, region.as_slice(), draft).map_err(|problem| fail(number, problem))?;
         }
         if self.grid.ends.len() != self.types.len() {
             let message = format!("{} cells, but {} types", self.grid.ends.len(), self.types.len());
@@ -97,8 +120,23 @@ impl Faces {
     }
 }
 
-/// Adds a cell of a VTK cell type.
-fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Problem> {
+/// Returns the group of a volume element's region.
+fn cell_region(
+    regions: Option<&(String, Vec<i64>)>,
+    kind: i64,
+    number: u64,
+    draft: &mut Draft<'_>,
+) -> Result<Option<usize>, Problem> {
+    let is_volume = matches!(kind, 10..=14 | 24..=27 | 29 | 31..=33 | 37 | 71..=74 | 78..=81);
+    let of = |(name, list): &(String, Vec<i64>)| Some((name.clone(), *list.get(usize::try_from(number).ok()?)?));
+    match regions.and_then(of) {
+        Some((name, value)) if is_volume => draft.group(&format!("{name} {value}")).map(Some),
+        _ => Ok(None),
+    }
+}
+
+/// Adds a cell of a VTK cell type; a volume element to the groups of its regions.
+fn cell(kind: i64, corners: &mut [i64], regions: &[usize], draft: &mut Draft<'_>) -> Result<(), Problem> {
     let mut face = |corners: &[i64], count: usize| {
         draft.drops_unused |= corners.len() > count;
         let short = || Problem::Syntax { message: format!("a cell of type {kind} with {} vertices", corners.len()) };
@@ -118,15 +156,15 @@ fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Pro
         // For a polygon with curved sides, the corners come first.
         36 => face(corners, corners.len() / 2),
         6 => draft.strip(corners, &[]),
-        10 | 24 | 71 | 78 => draft.cell(Cell::Tetrahedron, corners, &[]),
+        10 | 24 | 71 | 78 => draft.cell(Cell::Tetrahedron, corners, regions),
         11 if corners.len() == 8 => {
             corners.swap(2, 3);
             corners.swap(6, 7);
-            draft.cell(Cell::Hexahedron, corners, &[])
+            draft.cell(Cell::Hexahedron, corners, regions)
         }
-        12 | 25 | 29 | 33 | 72 | 79 => draft.cell(Cell::Hexahedron, corners, &[]),
-        13 | 26 | 31 | 32 | 73 | 80 => draft.cell(Cell::Prism, corners, &[]),
-        14 | 27 | 37 | 74 | 81 => draft.cell(Cell::Pyramid, corners, &[]),
+        12 | 25 | 29 | 33 | 72 | 79 => draft.cell(Cell::Hexahedron, corners, regions),
+        13 | 26 | 31 | 32 | 73 | 80 => draft.cell(Cell::Prism, corners, regions),
+        14 | 27 | 37 | 74 | 81 => draft.cell(Cell::Pyramid, corners, regions),
         0..=4 | 21 | 35 | 68 | 75 => {
             draft.lines += 1;
             Ok(())
@@ -269,14 +307,7 @@ fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError>
             let numbers = if kind == b"bit" { Some(Scalar::U8) } else { scalar(&kind) };
             let numbers = numbers.ok_or_else(|| source.syntax(format!("arrays of `{}` are not read", shown(&kind))))?;
             begin_data(source, is_binary);
-            let count = source.count(count, if is_binary { numbers.size() } else { 2 }, what)?;
-            if is_binary {
-                source.take(count * numbers.size(), what)?;
-            } else {
-                for _ in 0..count {
-                    source.word();
-                }
-            }
+            skip_values(source, is_binary, count, numbers)?;
         }
     }
     source.is_binary = false;
@@ -292,6 +323,84 @@ fn skip_text(source: &mut Source<'_>) -> Result<(), MeshError> {
     let length = bytes[1..].iter().fold(i64::from(first & 0x3f), |length, byte| length << 8 | i64::from(*byte));
     let length = source.count(length, 1, "letters")?;
     source.take(length, what)?;
+    Ok(())
+}
+
+/// Returns the first array at the cells that numbers regions. `source` is behind `CELL_DATA` or `POINT_DATA`.
+fn regions(
+    source: &mut Source<'_>,
+    is_binary: bool,
+    mut is_of_cells: bool,
+    allowance: &mut MemoryAllowance<'_>,
+) -> Result<Option<(String, Vec<i64>)>, MeshError> {
+    const WHAT: &str = "values at cells";
+    let mut count: i64 = source.number("a count of values")?;
+    while let Some(word) = source.peek() {
+        if is_word(Some(word), "METADATA") {
+            skip_metadata(source);
+            continue;
+        }
+        source.word();
+        match word.to_ascii_uppercase().as_slice() {
+            section @ (b"CELL_DATA" | b"POINT_DATA") => {
+                is_of_cells = section == b"CELL_DATA";
+                count = source.number("a count of values")?;
+            }
+            b"SCALARS" => {
+                let name = shown(source.word().unwrap_or_default());
+                let kind = source.word().unwrap_or_default().to_ascii_lowercase();
+                let components: i64 =
+                    if is_word(source.peek(), "LOOKUP_TABLE") { 1 } else { source.number("a count of components")? };
+                // `LOOKUP_TABLE` and its name.
+                source.word();
+                source.word();
+                let (numbers, values) = (scalar(&kind), count.checked_mul(components).unwrap_or(i64::MAX));
+                let Some(numbers) = numbers else { return Ok(None) };
+                begin_data(source, is_binary);
+                if is_of_cells && components == 1 && is_region(&name) && numbers.is_integer() {
+                    return Ok(Some((name, integers(source, is_binary, values, numbers, WHAT, allowance)?)));
+                }
+                skip_values(source, is_binary, values, numbers)?;
+            }
+            b"FIELD" => {
+                source.word();
+                let arrays: i64 = source.number("the count of arrays")?;
+                for _ in 0..source.count(arrays, 8, "arrays")? {
+                    while is_word(source.peek(), "METADATA") {
+                        skip_metadata(source);
+                    }
+                    let name = shown(source.word().ok_or_else(|| source.truncated("an array"))?);
+                    if is_of_cells && is_region(&name) {
+                        let (components, tuples): (i64, i64) = (source.number("components")?, source.number("tuples")?);
+                        let numbers = source.word().and_then(|kind| scalar(&kind.to_ascii_lowercase()));
+                        let Some(numbers) = numbers.filter(|of| of.is_integer() && components == 1) else {
+                            return Ok(None);
+                        };
+                        begin_data(source, is_binary);
+                        return Ok(Some((name, integers(source, is_binary, tuples, numbers, WHAT, allowance)?)));
+                    }
+                    skip_array(source, is_binary)?;
+                }
+            }
+            // Vectors and others.
+            _ => return Ok(None),
+        }
+    }
+    Ok(None)
+}
+
+/// Skips values in the encoding of the file.
+fn skip_values(source: &mut Source<'_>, is_binary: bool, count: i64, scalar: Scalar) -> Result<(), MeshError> {
+    let what = "values of an array";
+    let count = source.count(count, if is_binary { scalar.size() } else { 2 }, what)?;
+    if is_binary {
+        source.take(count * scalar.size(), what)?;
+    } else {
+        for _ in 0..count {
+            source.word();
+        }
+    }
+    source.is_binary = false;
     Ok(())
 }
 
@@ -356,8 +465,12 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 source.is_binary = false;
             }
             b"FIELD" => skip_field(&mut source, is_binary)?,
-            // Values at points and cells come last, and are ignored.
-            b"POINT_DATA" | b"CELL_DATA" => break,
+            // Values at points and cells come last. Those that number regions are read; what can't be read is ignored.
+            b"POINT_DATA" | b"CELL_DATA" => {
+                let is_of_cells = is_word(Some(word), "CELL_DATA");
+                faces.regions = regions(&mut source, is_binary, is_of_cells, &mut draft.allowance).unwrap_or_default();
+                break;
+            }
             _ => return Err(source.syntax(format!("`{}`: a section such as POINTS is expected", shown(word)))),
         }
     }

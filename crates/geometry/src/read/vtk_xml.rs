@@ -11,7 +11,7 @@ use quick_xml::events::{BytesStart, Event};
 use super::allowance::MemoryAllowance;
 use super::draft::Draft;
 use super::source::{Order, Scalar, Source, no_number, parsed, shown};
-use super::vtk::{Cells, Faces};
+use super::vtk::{Cells, Faces, is_region};
 use crate::{Element, MeshError, Problem};
 
 /// Limit for the arrays and for the pieces of a file. No real mesh has as many.
@@ -20,8 +20,8 @@ const MAX_ARRAYS: usize = 1 << 12;
 /// Decompressed data counts towards the file size up to this number of bytes for each compressed byte.
 const PACKED: usize = 4;
 
-/// The arrays that describe the surface: section and name. The points may have any name.
-const WANTED: [(&str, &str); 8] = [
+/// The arrays that describe the surface: section and name. The points may have any name, and arrays at cells those of [`is_region`].
+const WANTED: [(&str, &str); 9] = [
     ("Points", ""),
     ("Polys", "connectivity"),
     ("Polys", "offsets"),
@@ -30,7 +30,11 @@ const WANTED: [(&str, &str); 8] = [
     ("Cells", "connectivity"),
     ("Cells", "offsets"),
     ("Cells", "types"),
+    ("CellData", ""),
 ];
+
+/// The place of arrays at cells in [`WANTED`].
+const OF_CELLS: usize = 8;
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum ArrayFormat {
@@ -42,6 +46,7 @@ enum ArrayFormat {
 struct Array {
     /// Index in `WANTED`.
     role: usize,
+    name: String,
     scalar: Scalar,
     format: ArrayFormat,
     /// Position in the appended data.
@@ -63,6 +68,13 @@ struct Coding {
 fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
     let found = element.attributes().with_checks(false).flatten().find(|found| found.key.as_ref() == name)?;
     Some(found.value.into_owned())
+}
+
+/// Returns whether an array at cells numbers regions.
+fn is_region_array(element: &BytesStart<'_>, name: &str) -> bool {
+    let is_single = attribute(element, "NumberOfComponents").is_none_or(|count| count == "1" || count == "0");
+    let kind = attribute(element, "type").unwrap_or_default();
+    is_single && is_region(name) && scalar(&kind).is_some_and(Scalar::is_integer)
 }
 
 fn scalar(name: &str) -> Option<Scalar> {
@@ -199,6 +211,9 @@ impl<'a> Document<'a> {
         let name = attribute(element, "Name").unwrap_or_default();
         let is_wanted = |wanted: &(&str, &str)| wanted.0 == section && (wanted.1.is_empty() || wanted.1 == name);
         let Some(role) = WANTED.iter().position(is_wanted) else { return Ok(None) };
+        if role == OF_CELLS && !is_region_array(element, &name) {
+            return Ok(None);
+        }
         let syntax = |message: String| Problem::Syntax { message };
         let kind = attribute(element, "type").unwrap_or_default();
         let scalar =
@@ -210,7 +225,7 @@ impl<'a> Document<'a> {
             Some(other) => return Err(syntax(format!("`{}` is not a format of an array", shown(other.as_bytes())))),
         };
         let offset = attribute(element, "offset").and_then(|offset| offset.parse().ok()).unwrap_or(0);
-        Ok(Some(Array { role, scalar, format, offset, text: Vec::new(), byte }))
+        Ok(Some(Array { role, name, scalar, format, offset, text: Vec::new(), byte }))
     }
 
     fn fail(&self, array: &Array, problem: Problem) -> MeshError {
@@ -370,7 +385,10 @@ pub(super) fn read(file: &str, bytes: &[u8], draft: &mut Draft<'_>) -> Result<()
         let polygons = Cells { connectivity: integers(1)?, ends: integers(2)? };
         let strips = Cells { connectivity: integers(3)?, ends: integers(4)? };
         let grid = Cells { connectivity: integers(5)?, ends: integers(6)? };
-        let faces = Faces { polygons, strips, grid, types: integers(7)? };
+        let types = integers(7)?;
+        // What can't be read is ignored, as other values at cells are.
+        let regions = find(OF_CELLS).map(|array| array.name.clone()).zip(integers(OF_CELLS).ok());
+        let faces = Faces { polygons, strips, grid, types, regions };
         faces.add(file, first, draft)?;
         draft.allowance.give_back(faces.bytes());
     }

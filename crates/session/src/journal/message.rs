@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate_geometry::{Group, TriangleMesh};
+use palpate_geometry::{Group, TriangleMesh, VolumeRegion};
 use palpate_haptics::{Coupling, Tip, TipShape};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::journal as pb;
@@ -44,14 +44,26 @@ fn mesh(mesh: &TriangleMesh) -> pb::TriangleMesh {
         triangles: mesh.triangles.iter().flatten().copied().collect(),
         uv: mesh.uv.iter().flatten().flatten().flatten().copied().collect(),
         groups: mesh.groups.iter().map(group).collect(),
+        regions: mesh.regions.iter().map(region).collect(),
     }
 }
 
-fn from_mesh(message: &pb::TriangleMesh, limits: &Limits) -> Result<TriangleMesh> {
+fn region(region: &VolumeRegion) -> pb::VolumeRegion {
+    pb::VolumeRegion {
+        name: region.name.clone(),
+        vertices_m: region.vertices_m.iter().flat_map(DVec3::to_array).collect(),
+        triangles: region.triangles.iter().flatten().copied().collect(),
+    }
+}
+
+/// Triangles that form no surface make a solid, if they enclose one.
+fn from_mesh(message: &pb::TriangleMesh, is_solid: bool, limits: &Limits) -> Result<TriangleMesh> {
     let refuse = |reason, message: String| Err(Refusal::new(reason, "mesh", message));
     let (numbers, corners) = (message.vertices_m.len(), message.triangles.len());
-    if numbers / 3 > limits.mesh_vertices {
-        let message = format!("has {} vertices, more than {}", numbers / 3, limits.mesh_vertices);
+    let of_regions: usize = message.regions.iter().map(|region| region.vertices_m.len()).sum();
+    let numbers_in_all = numbers.saturating_add(of_regions);
+    if numbers_in_all / 3 > limits.mesh_vertices {
+        let message = format!("has {} vertices, more than {}", numbers_in_all / 3, limits.mesh_vertices);
         return refuse(Reason::TooLarge, message);
     }
     let is_whole = numbers.is_multiple_of(3)
@@ -62,6 +74,16 @@ fn from_mesh(message: &pb::TriangleMesh, limits: &Limits) -> Result<TriangleMesh
     if !is_whole || !within(&message.triangles) || !message.groups.iter().all(ascends) {
         return refuse(Reason::Unreadable, "has a triangle or a group without its vertices".to_owned());
     }
+    let is_region = |region: &pb::VolumeRegion| {
+        let numbers = region.vertices_m.len();
+        numbers.is_multiple_of(3)
+            && region.triangles.len().is_multiple_of(3)
+            && region.triangles.iter().all(|vertex| (*vertex as usize) < numbers / 3)
+            && region.vertices_m.iter().all(|number| number.is_finite())
+    };
+    if !message.regions.iter().all(is_region) {
+        return refuse(Reason::Unreadable, "has a region whose surface is not whole".to_owned());
+    }
     let of_corners = |uv: &[f32]| [[uv[0], uv[1]], [uv[2], uv[3]], [uv[4], uv[5]]];
     let mesh = TriangleMesh {
         vertices_m: message.vertices_m.chunks_exact(3).map(DVec3::from_slice).collect(),
@@ -70,8 +92,16 @@ fn from_mesh(message: &pb::TriangleMesh, limits: &Limits) -> Result<TriangleMesh
         groups: (message.groups.iter())
             .map(|group| Group { name: group.name.clone(), vertices: group.vertices.clone() })
             .collect(),
+        regions: (message.regions.iter())
+            .map(|region| VolumeRegion {
+                name: region.name.clone(),
+                vertices_m: region.vertices_m.chunks_exact(3).map(DVec3::from_slice).collect(),
+                triangles: region.triangles.chunks_exact(3).map(|of| [of[0], of[1], of[2]]).collect(),
+            })
+            .collect(),
     };
-    match palpate_geometry::report(&mesh).refusal() {
+    let report = palpate_geometry::report(&mesh);
+    match if is_solid { report.refusal_of_solid() } else { report.refusal() } {
         Some(finding) => refuse(Reason::Unreadable, finding.to_string()),
         None => Ok(mesh),
     }
@@ -117,7 +147,7 @@ pub fn model(header: &pb::Header, given: &Limits) -> Result<Arc<Model>> {
     let limits = limits(given);
     let mut message = required("scene", header.scene.as_ref())?.clone();
     set_absent_viscosity(&mut message);
-    let beside = header.mesh.as_ref().map(|mesh| from_mesh(mesh, &limits)).transpose()?;
+    let beside = header.mesh.as_ref().map(|mesh| from_mesh(mesh, message.solid.is_some(), &limits)).transpose()?;
     let mut scene = from_scene(&message, beside.as_ref()).map_err(|refusal| refusal.within("scene"))?;
     if let Some(appearance) = &header.appearance {
         scene.appearance = from_appearance(appearance)?;

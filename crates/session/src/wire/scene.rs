@@ -12,9 +12,9 @@ use super::required;
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
 use palpate_tissue::scene::sent::{self, MeshFile};
 use palpate_tissue::scene::{
-    Appearance, Body, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Gravity, Inclusion, Integrator, Lanes,
-    Layer, Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid, SolidMaterial, Springs,
-    Stepping, Substance, Volume,
+    Appearance, Body, Branch, Branches, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Gravity, Inclusion,
+    Integrator, Lanes, Layer, Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid,
+    SolidMaterial, Springs, Stepping, Substance, Volume,
 };
 use palpate_tissue::shape::RestShape;
 
@@ -176,7 +176,9 @@ fn from_solid(message: &pb::Scene, of_solid: &pb::Solid, mesh: &TriangleMesh) ->
         damping_per_s: of_solid.damping_per_s.unwrap_or(usual.damping_per_s),
         ..usual
     };
-    let material = material.with_viscosity(of_solid.viscosity_pa_s);
+    let branches = of_solid.branches.iter().enumerate().map(from_branch).collect::<Result<Vec<_>>>()?;
+    let branches = Branches::of(&branches, "solid.branches")?;
+    let material = SolidMaterial { branches, ..material.with_viscosity(of_solid.viscosity_pa_s) };
     let size = match (of_solid.cell_m, of_solid.cells) {
         (Some(cell_m), _) => CellSize::Edge(positive("solid.cell_m", cell_m)?),
         (None, Some(cells)) => CellSize::Count(f64::from(cells)),
@@ -202,6 +204,14 @@ fn from_layer((index, message): (usize, &pb::Layer)) -> Result<Layer> {
     Ok(Layer {
         thickness_m: required(&field("thickness_m"), message.thickness_m)?,
         stiffness_factor: required(&field("stiffness_factor"), message.stiffness_factor)?,
+    })
+}
+
+fn from_branch((index, message): (usize, &pb::Branch)) -> Result<Branch> {
+    let field = |key: &str| format!("solid.branches[{index}].{key}");
+    Ok(Branch {
+        shear_modulus_pa: required(&field("shear_modulus_pa"), message.shear_modulus_pa)?,
+        time_s: required(&field("time_s"), message.time_s)?,
     })
 }
 
@@ -463,6 +473,10 @@ fn solid(solid: &Solid) -> pb::Solid {
         thickness_m: Some(*thickness_m),
         stiffness_factor: Some(*stiffness_factor),
     };
+    let branch = |Branch { shear_modulus_pa, time_s }: &Branch| pb::Branch {
+        shear_modulus_pa: Some(*shear_modulus_pa),
+        time_s: Some(*time_s),
+    };
     pb::Solid {
         mesh_id: String::new(),
         cell_m: Some(solid.shape.lattice().edge_m),
@@ -475,6 +489,7 @@ fn solid(solid: &Solid) -> pb::Solid {
         viscosity_pa_s: Some(solid.material.viscosity_pa_s),
         foundation_n_per_m3: Some(solid.foundation_n_per_m3()).filter(|stiffness| *stiffness > 0.0),
         layers: solid.layers().iter().map(layer).collect(),
+        branches: solid.material.branches.iter().map(branch).collect(),
     }
 }
 
@@ -582,6 +597,7 @@ mod tests {
             triangles: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
             uv: None,
             groups: vec![Group { name: "lump".to_owned(), vertices: vec![1, 2] }],
+            regions: Vec::new(),
         }
     }
 

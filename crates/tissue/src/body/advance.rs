@@ -110,13 +110,13 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
             let apart = V::LANES < BLOCK;
             let mut work = sums[1];
             let (mut forces, mut mass) = (None, None);
+            if (FORCED || C::RELAXES) && !self.masses.is_null() {
+                mass = Some(V::load(self.masses.add(at)));
+            }
+            if (FORCED || C::RELAXES) && apart {
+                work = V::load(self.work.add(column % BLOCK));
+            }
             if FORCED {
-                if !self.masses.is_null() {
-                    mass = Some(V::load(self.masses.add(at)));
-                }
-                if apart {
-                    work = V::load(self.work.add(column % BLOCK));
-                }
                 forces = Some(match (DUTY, C::FORCES) {
                     (ROW_LOADED, 1) => force_field::force_of::<V, 1>(&self.pulls[0], at),
                     (ROW_LOADED, _) => force_field::force_of::<V, 2>(&self.pulls[0], at),
@@ -132,6 +132,7 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
                     kept[k] = V::load(self.kept[k].add(at));
                 }
                 let force = if let Some(forces) = &forces { Some(forces[c]) } else { None };
+                let relaxing = if C::RELAXES { Some(self.scheme.relaxing(n[c], &kept)) } else { None };
                 let (mut x, mut d) = self.scheme.advance(before[0], before[1], n[c], &mut kept, force);
                 if let Some(free) = free {
                     (x, d) = (x.mul(free), d.mul(free));
@@ -152,8 +153,13 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
                     let force = if let Some(mass) = mass { force.mul(mass) } else { force };
                     work = force.mul_add(self.scheme.travel(before, [x, d]), work);
                 }
+                // What a branch stores is no energy that a survey sees: to the guard it is a tool, along the increment just done.
+                if let Some(force) = relaxing {
+                    let force = if let Some(mass) = mass { force.mul(mass) } else { force };
+                    work = force.mul_add(before[1], work);
+                }
             }
-            if FORCED && apart {
+            if (FORCED || C::RELAXES) && apart {
                 work.store(self.work.add(column % BLOCK));
             } else {
                 sums[1] = work;

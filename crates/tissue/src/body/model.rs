@@ -77,8 +77,9 @@ pub struct Plan {
     /// The moments of a substep at which the tools' force is evaluated, with their weights: [`Scheme::nodes`]
     /// of `scheme`.
     pub nodes: Vec<QuadratureNode>,
-    /// The weights of the springs' force now and of the kept ones in that of viscosity: [`Scheme::viscous_weights`].
-    pub(crate) viscous_weights: Vec<f64>,
+    /// The weights of the springs' force now and of the kept fields in what viscosity and branches add to it:
+    /// [`Scheme::added_weights`].
+    pub(crate) added_weights: Vec<f64>,
     /// Whether the substep is within the stability bound ([`stability::is_stable`]). Only a number of substeps
     /// that the scene gives can be beyond it; then the model has a warning.
     pub stable: bool,
@@ -96,8 +97,8 @@ impl Plan {
         let substep_s = step_s / f64::from(substeps);
         let scaled = sheet.scaled(substep_s);
         let scheme = Scheme::fit(integrator, scaled);
-        let (nodes, viscous_weights) = (scheme.nodes(), scheme.viscous_weights(scaled.viscosity));
-        Plan { integrator, substeps, substep_s, scheme, nodes, viscous_weights, stable: true }
+        let (nodes, added_weights) = (scheme.nodes(), scheme.added_weights(&scaled));
+        Plan { integrator, substeps, substep_s, scheme, nodes, added_weights, stable: true }
     }
 
     /// Returns the same scheme with `by` times the substeps.
@@ -132,6 +133,7 @@ impl Oscillator {
             anchor_stiffness_n_per_m: scene.anchor_stiffness_n_per_m + 0.0,
             spring_stiffness_n_per_m: stability::largest_stiffness_n_per_m(scene),
             viscous_time_s: scene.body.kind().viscous_time_s(),
+            branches: scene.body.kind().branches(),
         }
     }
 }

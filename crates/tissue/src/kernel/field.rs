@@ -100,8 +100,8 @@ impl<T: Real> State<T> {
         [&mut self.u, &mut self.d].into_iter().chain(self.kept.iter_mut().map(Arc::make_mut))
     }
 
-    /// Returns the last values of the springs' force at a place, newest first: `now`, and the `count` values
-    /// that a multistep scheme keeps.
+    /// Returns the springs' force at a place, `now`, and the `count` values that a scheme keeps of the past: the last forces, newest
+    /// first, and filters of branches.
     pub(crate) fn history(&self, now: f64, count: usize, at: usize) -> Vec<f64> {
         std::iter::once(now).chain(self.kept[..count].iter().map(|field| field[at].wide())).collect()
     }

@@ -17,6 +17,26 @@ use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::Result;
 
+/// Largest number of branches of a tissue.
+pub const MAX_BRANCHES: usize = 3;
+
+/// A part of the springs' force that relaxes (a spring and a damper in series): γ·(N − z), where z follows the springs' force N,
+/// ż = (N − z)/τ.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MaxwellBranch {
+    /// γ, relative to the stiffness of the springs; 0 for no branch.
+    pub stiffness: f64,
+    /// τ, s; above 0.
+    pub time_s: f64,
+}
+
+impl Default for MaxwellBranch {
+    /// No branch.
+    fn default() -> Self {
+        MaxwellBranch { stiffness: 0.0, time_s: 1.0 }
+    }
+}
+
 /// An upper bound of the largest eigenvalue of the springs' stiffness under any deformation, and the place of
 /// that vibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -242,6 +262,11 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
     /// Returns τ of the springs, s: their force is N + τ·Ṅ, with N the elastic force.
     fn viscous_time_s(&self) -> f64 {
         0.0
+    }
+
+    /// Returns the parts of the springs' force that relax.
+    fn branches(&self) -> [MaxwellBranch; MAX_BRANCHES] {
+        [MaxwellBranch::default(); MAX_BRANCHES]
     }
 
     /// Returns the largest measured factor by which the true error of a script with an integrator may exceed that of a rehearsal.

@@ -422,6 +422,7 @@ impl BodyKind for Mesh {
             triangles: triangles.clone(),
             uv: told.uv.as_ref().map(|uv| triangles.iter().map(|of| corners(of, uv)).collect()),
             groups: told.groups.clone(),
+            regions: Vec::new(),
         })
     }
 

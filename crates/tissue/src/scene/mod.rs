@@ -36,7 +36,7 @@ use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use action_check::physical;
 use body::KindOfBody;
-pub use body::{BodyKind, StiffnessBound};
+pub use body::{BodyKind, MAX_BRANCHES, MaxwellBranch, StiffnessBound};
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 use mesh::read_bending;
@@ -45,7 +45,7 @@ pub use named::Named;
 use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{Shown, Simulated};
-pub use solid::{CellSize, FixedPart, Gravity, Layer, Solid, SolidMaterial, SolidShape};
+pub use solid::{Branch, Branches, CellSize, FixedPart, Gravity, Layer, Solid, SolidMaterial, SolidShape};
 use source::Files;
 pub use springs::Springs;
 pub use stepping::{Integrator, Lanes, Precision, Stepping};
@@ -526,6 +526,11 @@ impl Scene {
             integrator if !(integrator.takes_anchor_springs() || matches!(self.body, Body::Solid(_))) => {
                 "stormer is for [solid], which has no anchor springs"
             }
+            Integrator::Rk4 | Integrator::Exponential2 | Integrator::Exponential3 | Integrator::Exponential4
+                if self.body.kind().branches().iter().any(|branch| branch.stiffness > 0.0) =>
+            {
+                "leaves branches out: take stormer, central or lagged"
+            }
             Integrator::Rk4 if self.body.kind().viscous_time_s() > 0.0 => {
                 "rk4 leaves viscosity out: take another, or set material.viscosity_pa_s to 0"
             }
@@ -626,7 +631,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     let mut given = Body::SECTIONS.iter().filter_map(|section| Some((*section, fields.item(section)?)));
     let (first, second) = (given.next(), given.next());
     let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
-    let (layers, gravity) = (fields.item("layer"), fields.item("gravity"));
+    let (branches, layers, gravity) = (fields.item("branch"), fields.item("layer"), fields.item("gravity"));
     let of_material = material.is_some();
     if let (Some((section, _)), Some((_, other))) = (&first, &second) {
         let message = format!("does not go with [{section}]: a tissue is one of them");
@@ -645,6 +650,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     }
     if section != Solid::SECTION
         && let Some((item, message)) = (layers.as_ref().map(|item| (item, Layer::OF_A_SOLID)))
+            .or(branches.as_ref().map(|item| (item, Branches::OF_A_SOLID)))
             .or(gravity.as_ref().map(|item| (item, Gravity::OF_A_SOLID)))
     {
         return Err(item.refuse(Reason::WrongKind, message));
@@ -655,6 +661,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
             fields,
             &solid,
             material.as_ref(),
+            branches.as_ref(),
             layers.as_ref(),
             gravity.as_ref(),
         )?),

@@ -19,6 +19,15 @@ pub(crate) trait Arithmetic<T: Real> {
     /// Whether `advance` itself cuts values of u and d below [`Real::MIN_MAGNITUDE`] to 0.
     const CUTS: bool = false;
 
+    /// Whether a part of the springs' force relaxes: [`Arithmetic::relaxing`].
+    const RELAXES: bool = false;
+
+    /// Returns the force of the branches during the last increment: the mean of its beginning and its end.
+    #[inline(always)]
+    fn relaxing<V: Vector<Real = T>>(&self, n: V, _kept: &[V; MAX_KEPT]) -> V {
+        n.splat(T::default())
+    }
+
     /// Returns u and d after the (sub)step and updates `kept`. `force` is the tools' force in the scheme's
     /// units; a single field is passed twice.
     fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &mut [V; MAX_KEPT], force: Option<[V; 2]>)

@@ -84,7 +84,7 @@ fn integral(moments: &[[f64; 2]], polynomial: &[f64]) -> [f64; 2] {
 /// Fits the scheme to a tissue and a substep.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn fit<const ORDER: usize>(of: Coefficients) -> Multistep<ORDER> {
-    let Coefficients { anchor: a, damping: g, viscosity } = of;
+    let Coefficients { anchor: a, damping: g, viscosity, .. } = of;
     // y′ = A·y + b·c₀, cⱼ′ = cⱼ₊₁: starting from c = the j-th unit vector, c₀ is sʲ/j!, and y(1) is its integral.
     let powers = ORDER + 1;
     let system = Matrix::of(2 + powers, |i, j| match (i, j) {
@@ -359,7 +359,7 @@ mod tests {
 
     #[test]
     fn a_point_that_is_released_goes_on_from_where_the_tool_held_it() {
-        let scheme = fit::<3>(Coefficients { anchor: 0.02, damping: 0.1, viscosity: 0.3 });
+        let scheme = fit::<3>(Coefficients { anchor: 0.02, damping: 0.1, viscosity: 0.3, ..Coefficients::default() });
         let (held, springs) = ([0.7, -0.2], &SPRINGS[..4]);
         let at = Release { u: held[0], springs, used: 0.0, scale: 1.0, lost_n: 0.0 };
         let [du, dd] = scheme.release(at).unwrap();
@@ -375,6 +375,7 @@ mod tests {
                 anchor: 0.02 * ratio * ratio,
                 damping: 0.1 * ratio,
                 viscosity: 0.3 / ratio,
+                ..Coefficients::default()
             };
             let (from, to) = (fit::<4>(of(1.0)), fit::<4>(of(ratio)));
             let (state, mut springs) = ([0.7, -0.2], SPRINGS);

@@ -19,7 +19,7 @@ pub struct QuadratureNode {
 pub(crate) struct Release<'a> {
     /// The displacement.
     pub(crate) u: f64,
-    /// The springs' force now, then the forces that the scheme keeps, newest first.
+    /// The springs' force now, then the forces that the scheme keeps, newest first, then the filters of branches.
     pub(crate) springs: &'a [f64],
     /// The tools' force that the substep uses.
     pub(crate) used: f64,
@@ -55,6 +55,11 @@ pub(crate) trait Family {
     /// Returns how many of the kept fields, from the first, are the springs' forces of earlier substeps, newest
     /// first.
     fn history(&self) -> usize {
+        0
+    }
+
+    /// Returns how many of the kept fields, after those of the history, are filters of branches.
+    fn filters(&self) -> usize {
         0
     }
 
@@ -101,7 +106,7 @@ pub(crate) trait Family {
     fn release(&self, at: Release<'_>) -> Option<[f64; 2]>;
 
     /// Converts u and d of one component of a point to the same scheme with another substep, `ratio` times as
-    /// long. Also converts `springs`: the springs' force now, then the kept forces, newest first. `pushed` is
-    /// the tools' force.
+    /// long. Also converts `springs`: the springs' force now, then the kept forces, newest first, then the filters of branches. `pushed`
+    /// is the tools' force.
     fn resample(&self, to: &Self, ratio: f64, state: [f64; 2], pushed: f64, springs: &mut [f64]) -> [f64; 2];
 }

@@ -9,6 +9,7 @@ pub(crate) mod arithmetic;
 mod central;
 mod exponential;
 pub(crate) mod family;
+mod filter;
 mod lagged_damping;
 mod matrix;
 pub(crate) mod observer;
@@ -21,7 +22,8 @@ mod stormer;
 pub use central::TwoStep;
 pub use exponential::Multistep;
 pub use family::QuadratureNode;
-pub use oscillator::{Coefficients, Oscillator};
+use filter::BranchFilter;
+pub use oscillator::{Coefficients, Oscillator, ScaledBranch};
 pub use relaxation::Relaxation;
 pub use rk4::Rk4;
 
@@ -36,9 +38,11 @@ use matrix::Matrix;
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scheme {
     /// `central` and `lagged`, which differ in their coefficients alone.
-    TwoStep(TwoStep<false>),
+    TwoStep(TwoStep<0>),
     /// `stormer`, and `central` and `lagged` of a viscous tissue: they keep 2 earlier forces of the springs.
-    LongTwoStep(TwoStep<true>),
+    LongTwoStep(TwoStep<2>),
+    /// The two-step schemes of a tissue with branches: they also keep a filter of each.
+    RelaxingTwoStep(TwoStep<5>),
     /// The exponential multistep scheme that keeps 2 earlier forces of the springs.
     Exponential2(Multistep<2>),
     /// The exponential multistep scheme that keeps 3 earlier forces of the springs.
@@ -56,6 +60,7 @@ macro_rules! each {
         match $scheme {
             $crate::scheme::Scheme::TwoStep($family) => $body,
             $crate::scheme::Scheme::LongTwoStep($family) => $body,
+            $crate::scheme::Scheme::RelaxingTwoStep($family) => $body,
             $crate::scheme::Scheme::Exponential2($family) => $body,
             $crate::scheme::Scheme::Exponential3($family) => $body,
             $crate::scheme::Scheme::Exponential4($family) => $body,
@@ -99,8 +104,12 @@ const CANDIDATES_OF_VISCOUS: [Integrator; 4] =
     [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Stormer];
 
 /// Returns the integrators that `auto` may become for a tissue, by falling order.
-pub(crate) fn candidates(of: &Oscillator) -> [Integrator; 4] {
-    if of.viscous_time_s > 0.0 { CANDIDATES_OF_VISCOUS } else { CANDIDATES }
+pub(crate) fn candidates(of: &Oscillator) -> &'static [Integrator] {
+    match of {
+        _ if of.relaxes() => &[Integrator::Stormer],
+        _ if of.viscous_time_s > 0.0 => &CANDIDATES_OF_VISCOUS,
+        _ => &CANDIDATES,
+    }
 }
 
 /// Returns the entry of an integrator in the register.
@@ -116,7 +125,7 @@ pub(crate) fn entry(integrator: Integrator) -> Entry {
         Integrator::Lagged => other(1.0, 1.0, Bound::TurnAndLag, |of| two_step(of, lagged_damping::fit(of))),
         // It evaluates the springs four times.
         Integrator::Rk4 => other(4.0, 4.0, Bound::Stable, |of| Scheme::Rk4(Rk4 { a: of.anchor, g: of.damping })),
-        Integrator::Stormer => other(2.0, 1.1, Bound::Stable, |of| Scheme::LongTwoStep(stormer::fit(of))),
+        Integrator::Stormer => other(2.0, 1.1, Bound::Stable, |of| long_two_step(of, stormer::fit(of))),
         Integrator::Exponential2 => exponential(3.0, 1.3, |of| Scheme::Exponential2(exponential::fit(of))),
         Integrator::Exponential3 => exponential(4.0, 1.4, |of| Scheme::Exponential3(exponential::fit(of))),
         Integrator::Exponential4 => exponential(5.0, 1.6, |of| Scheme::Exponential4(exponential::fit(of))),
@@ -124,8 +133,13 @@ pub(crate) fn entry(integrator: Integrator) -> Entry {
 }
 
 /// Returns the scheme of a fitted two-step form: that of an elastic tissue keeps no force.
-fn two_step(of: Coefficients, fitted: TwoStep<true>) -> Scheme {
-    if of.viscosity > 0.0 { Scheme::LongTwoStep(fitted) } else { Scheme::TwoStep(fitted.elastic()) }
+fn two_step(of: Coefficients, fitted: TwoStep<5>) -> Scheme {
+    if of.viscosity > 0.0 || of.relaxes() { long_two_step(of, fitted) } else { Scheme::TwoStep(fitted.keeping()) }
+}
+
+/// Returns the scheme of a fitted two-step form that keeps forces.
+fn long_two_step(of: Coefficients, fitted: TwoStep<5>) -> Scheme {
+    if of.relaxes() { Scheme::RelaxingTwoStep(fitted) } else { Scheme::LongTwoStep(fitted.keeping()) }
 }
 
 /// Returns `to` if it has the same type as `_from`.
@@ -210,15 +224,30 @@ impl Scheme {
     }
 
     /// Returns how many of the kept fields, from the first, are the springs' forces of earlier substeps, newest
-    /// first: p for the exponential schemes, 2 for a two-step scheme that keeps them, otherwise 0.
+    /// first, with what branches added: p for the exponential schemes, 2 for a two-step scheme that keeps them, otherwise 0.
     pub fn history(&self) -> usize {
         each!(self, |family| family.history())
     }
 
-    /// Returns the weights of the springs' force now and of the kept ones, newest first, in β·Ṅ; empty without viscosity.
-    pub(crate) fn viscous_weights(&self, viscosity: f64) -> Vec<f64> {
-        let count = if viscosity > 0.0 && self.history() > 0 { 1 + self.history() } else { 0 };
-        exponential::rate_weights(count).into_iter().map(|weight| viscosity * weight).collect()
+    /// Returns how many of the kept fields, from the first, follow from the springs' forces: those of [`Scheme::history`], then the
+    /// filters of branches.
+    pub(crate) fn kept_of_springs(&self) -> usize {
+        self.history() + each!(self, |family| family.filters())
+    }
+
+    /// Returns the weights of the springs' force now and of the kept values that follow from it in β·Ṅ and the branches; empty without
+    /// viscosity and branches.
+    pub(crate) fn added_weights(&self, of: &Coefficients) -> Vec<f64> {
+        let count = if self.history() > 0 && (of.viscosity > 0.0 || of.relaxes()) { 1 + self.history() } else { 0 };
+        let viscous = exponential::rate_weights(count).into_iter().map(|weight| of.viscosity * weight);
+        let mut weights: Vec<f64> = viscous.collect();
+        if self.kept_of_springs() > self.history() {
+            // Viscosity acts on the branches as well.
+            let (filters, of_whole) = (of.branches.map(BranchFilter::of), 1.0 + weights[0]);
+            weights[0] = of_whole * BranchFilter::whole(&filters) - 1.0;
+            weights.extend(filters.map(|filter| -of_whole * filter.pull));
+        }
+        weights
     }
 
     /// Returns the matrix that advances (u, d, kept values) by one substep, for a single vibration without
@@ -263,7 +292,7 @@ mod tests {
     use super::*;
 
     fn elastic(anchor: f64, damping: f64) -> Coefficients {
-        Coefficients { anchor, damping, viscosity: 0.0 }
+        Coefficients { anchor, damping, ..Coefficients::default() }
     }
 
     #[test]
@@ -274,6 +303,7 @@ mod tests {
             anchor_stiffness_n_per_m: 7.0,
             spring_stiffness_n_per_m: 130.0,
             viscous_time_s: 0.0,
+            branches: Default::default(),
         };
         for substep_s in [1e-4, 1e-3, 0.02] {
             let (of, z) = (oscillator.scaled(substep_s), oscillator.scaled_spring_stiffness(substep_s));

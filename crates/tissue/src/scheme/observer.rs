@@ -11,8 +11,9 @@ use crate::kernel::real::Real;
 
 /// The arithmetic of any scheme in one number format, without compensation: observing needs none.
 pub(crate) enum Observer<T: Real> {
-    TwoStep(<TwoStep<false> as Family>::Plain<T>),
-    LongTwoStep(<TwoStep<true> as Family>::Plain<T>),
+    TwoStep(<TwoStep<0> as Family>::Plain<T>),
+    LongTwoStep(<TwoStep<2> as Family>::Plain<T>),
+    RelaxingTwoStep(<TwoStep<5> as Family>::Plain<T>),
     Exponential2(<Multistep<2> as Family>::Plain<T>),
     Exponential3(<Multistep<3> as Family>::Plain<T>),
     Exponential4(<Multistep<4> as Family>::Plain<T>),
@@ -25,6 +26,7 @@ macro_rules! with {
         match $observer {
             Observer::TwoStep($arithmetic) => $body,
             Observer::LongTwoStep($arithmetic) => $body,
+            Observer::RelaxingTwoStep($arithmetic) => $body,
             Observer::Exponential2($arithmetic) => $body,
             Observer::Exponential3($arithmetic) => $body,
             Observer::Exponential4($arithmetic) => $body,
@@ -44,6 +46,7 @@ impl<T: Real> Observer<T> {
         match scheme {
             Scheme::TwoStep(family) => Observer::TwoStep(family.plain(0)),
             Scheme::LongTwoStep(family) => Observer::LongTwoStep(family.plain(0)),
+            Scheme::RelaxingTwoStep(family) => Observer::RelaxingTwoStep(family.plain(0)),
             Scheme::Exponential2(family) => Observer::Exponential2(family.plain(0)),
             Scheme::Exponential3(family) => Observer::Exponential3(family.plain(0)),
             Scheme::Exponential4(family) => Observer::Exponential4(family.plain(0)),
@@ -54,6 +57,12 @@ impl<T: Real> Observer<T> {
     /// Returns how many fields the scheme keeps besides u and d.
     pub(crate) fn kept(&self) -> usize {
         with!(self, |arithmetic| kept_of(arithmetic))
+    }
+
+    /// Returns the force of the branches during the last increment ([`Arithmetic::relaxing`]); `None` without branches.
+    #[inline(always)]
+    pub(crate) fn relaxing<V: Vector<Real = T>>(&self, n: V, kept: &[V; MAX_KEPT]) -> Option<V> {
+        if let Observer::RelaxingTwoStep(arithmetic) = self { Some(arithmetic.relaxing(n, kept)) } else { None }
     }
 
     /// Returns u, w and the square of w in the form of the scheme's conserved energy ([`Arithmetic::observe`],

@@ -1,5 +1,7 @@
 //! The properties of a tissue that a scheme is fitted to.
 
+use crate::scene::{MAX_BRANCHES, MaxwellBranch};
+
 /// The properties of a tissue that a scheme depends on, for a point of the reference mass. [`Oscillator::of`]
 /// takes them from a scene.
 #[derive(Debug, Clone, Copy)]
@@ -15,6 +17,8 @@ pub struct Oscillator {
     pub spring_stiffness_n_per_m: f64,
     /// τ of the springs, s: their force is N + τ·Ṅ with N the elastic force (Kelvin–Voigt); 0 if they are elastic.
     pub viscous_time_s: f64,
+    /// Parts of the springs' force that relax.
+    pub branches: [MaxwellBranch; MAX_BRANCHES],
 }
 
 /// The coefficients of the equation of motion, without unit, for a substep of length dt.
@@ -26,15 +30,48 @@ pub struct Coefficients {
     pub damping: f64,
     /// β = τ/dt.
     pub viscosity: f64,
+    /// Parts of the springs' force that relax.
+    pub branches: [ScaledBranch; MAX_BRANCHES],
+}
+
+/// A branch ([`MaxwellBranch`]) for a substep of length dt: γ·(N − z) with ż = (N − z)/θ.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ScaledBranch {
+    /// γ; 0 for no branch.
+    pub stiffness: f64,
+    /// θ = τ/dt.
+    pub substeps: f64,
+}
+
+impl Default for ScaledBranch {
+    /// No branch.
+    fn default() -> Self {
+        ScaledBranch { stiffness: 0.0, substeps: 1.0 }
+    }
+}
+
+impl Coefficients {
+    /// Returns whether a part of the springs' force relaxes.
+    pub fn relaxes(&self) -> bool {
+        self.branches.iter().any(|branch| branch.stiffness > 0.0)
+    }
 }
 
 impl Oscillator {
+    /// Returns whether a part of the springs' force relaxes.
+    pub fn relaxes(&self) -> bool {
+        self.branches.iter().any(|branch| branch.stiffness > 0.0)
+    }
+
     /// Returns the coefficients for a substep of length dt = `substep_s`, s.
     pub fn scaled(&self, substep_s: f64) -> Coefficients {
         Coefficients {
             anchor: self.anchor_stiffness_n_per_m * substep_s * substep_s / self.mass_kg,
             damping: self.damping_n_s_per_m * substep_s / self.mass_kg,
             viscosity: self.viscous_time_s / substep_s,
+            branches: self
+                .branches
+                .map(|MaxwellBranch { stiffness, time_s }| ScaledBranch { stiffness, substeps: time_s / substep_s }),
         }
     }
 

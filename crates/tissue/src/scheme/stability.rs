@@ -188,6 +188,7 @@ mod tests {
                     anchor_stiffness_n_per_m: 5.0,
                     spring_stiffness_n_per_m,
                     viscous_time_s: 0.0,
+                    branches: Default::default(),
                 };
                 for integrator in all() {
                     let grows = |substeps: u32| {
@@ -249,7 +250,7 @@ mod tests {
                     Integrator::Exponential3 | Integrator::Exponential4 => 1e-3,
                     _ => 2e-3,
                 };
-                let of = Coefficients { anchor: a, damping: g, viscosity };
+                let of = Coefficients { anchor: a, damping: g, viscosity, ..Coefficients::default() };
                 let found = Scheme::fit(integrator, of).growth(z);
                 assert!((found - truth).abs() < within, "{integrator:?} {a} {g} {z} {viscosity}: {found} {truth}");
             }
@@ -277,6 +278,7 @@ mod tests {
                 anchor_stiffness_n_per_m: 0.0,
                 spring_stiffness_n_per_m: 300.0,
                 viscous_time_s,
+                branches: Default::default(),
             };
             for integrator in all().filter(|integrator| *integrator != Integrator::Rk4) {
                 let substeps = substeps(integrator, 1e-3, &oscillator);
@@ -296,6 +298,7 @@ mod tests {
             anchor_stiffness_n_per_m: 0.0,
             spring_stiffness_n_per_m: 0.0,
             viscous_time_s: 0.0,
+            branches: Default::default(),
         };
         for integrator in all() {
             assert_eq!(substeps(integrator, 1e-3, &oscillator), 1, "{integrator:?}");

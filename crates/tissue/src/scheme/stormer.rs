@@ -12,7 +12,7 @@ use super::oscillator::Coefficients;
 const SECOND: [f64; 3] = [1.0 / 12.0, -2.0 / 12.0, 1.0 / 12.0];
 
 /// Fits the scheme to a tissue and a substep.
-pub(super) fn fit(of: Coefficients) -> TwoStep<true> {
+pub(super) fn fit(of: Coefficients) -> TwoStep<5> {
     let fitted = central::fit(of);
     TwoStep { springs: [0, 1, 2].map(|i: usize| fitted.springs[i] + SECOND[i]), ..fitted }
 }

@@ -194,7 +194,7 @@ impl Chooser<'_> {
     fn integrators(&self) -> impl Iterator<Item = Integrator> + use<> {
         let (asked, compensates) = (self.stepping.integrator, self.stepping.precision == Precision::Compensated);
         let candidates =
-            scheme::candidates(&self.sheet).into_iter().filter(move |of| !compensates || entry(*of).compensates);
+            scheme::candidates(&self.sheet).iter().copied().filter(move |of| !compensates || entry(*of).compensates);
         let (named, candidates) =
             if asked == Integrator::Auto { (None, Some(candidates)) } else { (Some(asked), None) };
         named.into_iter().chain(candidates.into_iter().flatten())
@@ -323,7 +323,7 @@ impl Chooser<'_> {
 /// that `auto` may choose). Saturates for absurd scenes.
 pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let is_open = |integrator: Integrator| asked == Integrator::Auto || asked == integrator;
-    let open = scheme::candidates(sheet).into_iter().filter(|integrator| is_open(*integrator));
+    let open = scheme::candidates(sheet).iter().copied().filter(|integrator| is_open(*integrator));
     let least = open.map(|integrator| stability::stable_substeps(integrator, step_s, sheet)).min();
     least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
 }

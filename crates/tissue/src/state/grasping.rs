@@ -43,7 +43,7 @@ impl<T: Real> StepContext<'_, T> {
             let at = c * tables.layout.plane + tables.layout.offset(index);
             *change = plan.scheme.release(Release {
                 u: state.u[at].wide(),
-                springs: &state.history(springs[c], plan.scheme.history(), at),
+                springs: &state.history(springs[c], plan.scheme.kept_of_springs(), at),
                 used: used[c],
                 scale,
                 lost_n: scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c] / mass,

@@ -112,9 +112,10 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Returns the part of the work done that belongs to the next interval: half of the work of the last
-    /// increment (`scheme::central`), J.
+    /// increment (`scheme::central`), less that of branches, which the next sweep adds, J.
     pub(super) fn present_work_j(&self, survey: &Survey) -> f64 {
-        if self.plan.scheme.takes_means() { 0.5 * survey.power * self.plan.unit_of_work_j(&self.model) } else { 0.0 }
+        let present = if self.plan.scheme.takes_means() { 0.5 * survey.power - survey.relaxing } else { 0.0 };
+        present * self.plan.unit_of_work_j(&self.model)
     }
 
     /// Stores the present state as the state to go back to.

@@ -127,14 +127,14 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
             found[0][c] = u.0 * model.unit_m;
             found[1][c] = if still { 0.0 } else { w.0 * model.unit_m / plan.substep_s };
             // At rest nothing resists.
-            let mut viscous = 0.0;
-            if !still && !plan.viscous_weights.is_empty() {
-                viscous = plan.viscous_weights[0] * n.0;
-                for k in 1..plan.viscous_weights.len() {
-                    viscous += plan.viscous_weights[k] * kept[k - 1].0;
+            let mut added = 0.0;
+            if !still && !plan.added_weights.is_empty() {
+                added = plan.added_weights[0] * n.0;
+                for k in 1..plan.added_weights.len() {
+                    added += plan.added_weights[k] * kept[k - 1].0;
                 }
             }
-            found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0 + viscous, state.u[at].wide());
+            found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0 + added, state.u[at].wide());
         }
         found
     }

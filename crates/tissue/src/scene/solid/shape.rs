@@ -13,7 +13,7 @@ use crate::limits::Limits;
 use crate::scene::mesh::{MeshShape, group_named};
 use crate::scene::shown::{findings_of, to_repair};
 use crate::shape::{CellPlace, Deepest, Extent, PointId, PointName, RestShape, ShownShape};
-use palpate_refusal::{Reason, Refusal, Result, legible};
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, legible};
 
 /// The number of a corner of the lattice that is no point.
 const NO_POINT: u32 = u32::MAX;
@@ -192,6 +192,32 @@ impl SolidShape {
         shape.surface.prepare_contact();
         shape.vertex_of = places().map(|place_m| nearest_vertex(&shape.surface, place_m)).collect();
         shape
+    }
+
+    /// Returns how much of each cube that a region of the file reaches is the region's, 0 to 1, of what is inside; by
+    /// [`Lattice::index`].
+    ///
+    /// # Errors
+    /// Refuses a name that no region has, with the field `field`.
+    pub(super) fn region_parts(&self, name: &str, field: &str) -> Result<Vec<(usize, f64)>> {
+        let regions = &self.source.regions;
+        let Some(region) = regions.iter().find(|region| region.name == name) else {
+            let names = || regions.iter().map(|region| region.name.as_str());
+            let message = match regions.as_slice() {
+                [] => "is for a file with volume elements in named groups; in others an inclusion of a solid is a ball, with \
+                       centre_m and radius_m"
+                    .to_owned(),
+                _ => {
+                    let (meant, all) = (did_you_mean(name, names()), names().take(8).collect::<Vec<_>>().join(", "));
+                    format!("the file has no region `{}`{meant}; it has {all}", excerpt(name))
+                }
+            };
+            return Err(Refusal::new(Reason::WrongKind, field, message));
+        };
+        let of_region = filled(&region.vertices_m, &region.triangles, &self.lattice).parts;
+        let share = |(region, whole): (&f32, &f32)| f64::from(*region / whole.max(*region).max(f32::MIN_POSITIVE));
+        let shares = of_region.iter().zip(&self.parts).map(share).enumerate();
+        Ok(shares.filter(|(_, share)| *share > 0.0).collect())
     }
 
     /// Fixes the points of some parts.

@@ -37,6 +37,7 @@ fn rounding_in_f32_grows_with_damping_and_with_shorter_substeps_and_is_less_in_b
         anchor_stiffness_n_per_m: 5.0,
         spring_stiffness_n_per_m: 120.0,
         viscous_time_s: 0.0,
+        branches: Default::default(),
     };
     let of = |precision, damping, substep_s| rounding(precision, &sheet(damping), substep_s);
     let compensated = of(Precision::Compensated, 0.5, 1e-3);

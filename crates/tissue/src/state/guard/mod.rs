@@ -83,7 +83,7 @@ pub(crate) fn convert<T: Real>(
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {
             let at = c * layout.plane + layout.offset(index);
-            let mut history = state.history(n.wide(), from.scheme.history(), at);
+            let mut history = state.history(n.wide(), from.scheme.kept_of_springs(), at);
             let now = [state.u[at].wide(), state.d[at].wide()];
             let [u, d] = from.scheme.resample(&to.scheme, ratio, now, pushed[c], &mut history);
             (state.u[at], state.d[at]) = (T::of(u), T::of(d));

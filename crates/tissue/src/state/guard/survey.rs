@@ -44,13 +44,15 @@ pub(crate) struct Survey {
     pub(crate) imbalance: f64,
     /// Σ F·d of the tools.
     pub(crate) power: f64,
+    /// Work of the branches along the last increment.
+    pub(crate) relaxing: f64,
 }
 
-/// The sums of w², u², spring energy, conserved w² and F·d; and the maxima.
+/// The sums of w², u², spring energy, conserved w², F·d and the work of branches; and the maxima.
 #[derive(Debug)]
 struct Sums<T> {
-    row: [[T; BLOCK]; 5],
-    total: [[f64; BLOCK]; 5],
+    row: [[T; BLOCK]; 6],
+    total: [[f64; BLOCK]; 6],
     largest: [[T; BLOCK]; 4],
 }
 
@@ -152,7 +154,7 @@ impl Survey {
             write == Write::Nothing || [to_u, to_d].iter().chain(&to_kept).take(needed).all(|field| !field.is_null())
         );
         let zero = [T::default(); BLOCK];
-        let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
+        let sums = UnsafeCell::new(Sums { row: [zero; 6], total: [[0.0; BLOCK]; 6], largest: [zero; 4] });
         let pulls = forces.terms.iter().map(|term| term.pull(forces.field, tables.layout.stride));
         let pulls: Vec<Pull<'_, T>> = pulls.collect();
         let [masses, extra] = tables.masses_and_extra();
@@ -188,6 +190,7 @@ impl Survey {
             speed: most(2),
             imbalance: most(3),
             power: sum(4),
+            relaxing: sum(5),
         }
     }
 }
@@ -226,7 +229,7 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
             let free = if self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             let (part, pull) = (V::of(T::of(part)), V::of(T::of(pull)));
             let zero = V::of(T::default());
-            let (mut speed, mut displacement, mut conserved, mut power) = (zero, zero, zero, zero);
+            let (mut speed, mut displacement, mut conserved, mut power, mut relaxing) = (zero, zero, zero, zero, zero);
             let mut most = [zero; 4];
             for c in 0..3 {
                 let at = at + c * self.layout.plane;
@@ -242,6 +245,9 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
                 conserved = conserved.add(conserved_w_squared);
                 displacement = u.mul_add(u, displacement);
                 power = pushed.mul_add(d, power);
+                if let Some(force) = self.observer.relaxing(n[c], &kept) {
+                    relaxing = force.mul_add(d, relaxing);
+                }
                 let mut short = n[c].minus(pull, u).add(pushed);
                 let (mut seen, mut speed_seen) = (u, w);
                 if let Some(free) = free {
@@ -274,7 +280,7 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
             if !self.masses.is_null() {
                 let mass = V::load(self.masses.add(at));
                 [speed, displacement] = [speed.mul(mass), displacement.mul(mass)];
-                [conserved, power] = [conserved.mul(mass), power.mul(mass)];
+                [conserved, power, relaxing] = [conserved.mul(mass), power.mul(mass), relaxing.mul(mass)];
             }
             if !self.extra.is_null() {
                 displacement = displacement.mul_add(V::load(self.extra.add(at)), displacement);
@@ -283,6 +289,7 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
             self.add(1, column, displacement);
             self.add(3, column, conserved);
             self.add(4, column, power);
+            self.add(5, column, relaxing);
             for (which, most) in most.into_iter().enumerate() {
                 let largest = (&raw mut (*self.sums.get()).largest[which]).cast::<T>().add(column % BLOCK);
                 V::load(largest).farther(most).store(largest);

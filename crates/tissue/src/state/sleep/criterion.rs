@@ -10,11 +10,21 @@ use crate::scene::Precision;
 use crate::scheme::stability;
 use crate::scheme::{Coefficients, Oscillator, Relaxation};
 use crate::state::guard::survey::{Forces, Survey, Write, energy_of};
-use crate::state::sleep::tiles::SleepTiles;
+use crate::state::sleep::tiles::{CHECK_STEPS, SleepTiles};
 use crate::state::step_context::StepContext;
 use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;
+
+/// Returns the factor by which the recent largest displacement decays from one check of the tiles to the next: by a hundredth, or
+/// slower than a tissue with branches creeps back, which would otherwise stay as large as its memory.
+fn forget(model: &Model) -> f64 {
+    const USUAL: f64 = 0.99;
+    const TIMES_CREEP: f64 = 8.0;
+    let creep_s = TIMES_CREEP * Relaxation::of(&model.scene).creep_s();
+    let check_s = CHECK_STEPS as f64 / model.scene.stepping.rate_hz;
+    if creep_s > 0.0 { USUAL.max(libm::exp(-check_s / creep_s)) } else { USUAL }
+}
 
 /// Wakes tiles on which the tools' force changes in step `step`.
 pub(crate) fn wake_pushed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, applied: &mut Applied<T>, step: u64) {
@@ -125,7 +135,7 @@ pub(crate) fn put_to_sleep<T: Real>(
     let unknown = half_digit * rough.scaled_spring_stiffness(plan.substep_s) + creep * drag;
     let creep = creep * tiles.largest;
     let slow = |epsilon: f64| (epsilon * restoring.sqrt()).max(creep);
-    let settled = tiles.quiescent_tiles(&state.u, &state.d, slow);
+    let settled = tiles.quiescent_tiles(&state.u, &state.d, forget(model), slow);
     let epsilon = tiles.epsilon();
     let scale = plan.scheme.spring_scale();
     let forces = Forces {

@@ -49,9 +49,6 @@ const CALM_CHECKS: u8 = 2;
 /// up to three and a half times the ε of a tile, where a whole sheet creeps in one direction.)
 const PART: f64 = 0.25;
 
-/// Factor by which the recent largest displacement decays from one check to the next.
-const FORGET: f64 = 0.99;
-
 /// The name of the tables in messages.
 const TABLES: &str = "the tiles of a tissue";
 
@@ -419,8 +416,15 @@ impl<T: Real> SleepTiles<T> {
     }
 
     /// Samples a few points of each awake tile. Updates the largest displacement, and returns the tiles that
-    /// may be calm because all sampled increments are at most `slow`.
-    pub(crate) fn quiescent_tiles(&mut self, u: &Field<T>, d: &Field<T>, slow: impl Fn(f64) -> f64) -> Vec<usize> {
+    /// may be calm because all sampled increments are at most `slow`. The recent largest displacement decays by the factor
+    /// `forget`.
+    pub(crate) fn quiescent_tiles(
+        &mut self,
+        u: &Field<T>,
+        d: &Field<T>,
+        forget: f64,
+        slow: impl Fn(f64) -> f64,
+    ) -> Vec<usize> {
         let Layout { stride, plane, .. } = self.layout;
         let most = |field: &Field<T>, tile: usize| {
             let [rows, columns] = sides_of(&self.layout, tile);
@@ -435,7 +439,7 @@ impl<T: Real> SleepTiles<T> {
             }
             most
         };
-        let largest = self.region.tiles().iter().map(|tile| most(u, *tile)).fold(self.largest * FORGET, f64::max);
+        let largest = self.region.tiles().iter().map(|tile| most(u, *tile)).fold(self.largest * forget, f64::max);
         let slow = slow(self.epsilon_of(largest));
         let (settled, moving): (Vec<usize>, Vec<usize>) =
             self.region.tiles().iter().partition(|tile| most(d, **tile) <= slow);

@@ -94,9 +94,9 @@ fn a_movement_at_an_end_or_in_the_middle_of_a_tile_is_seen() {
             let (mut tiles, at) = (tiles(), offset(n % 3, point));
             tiles.wake_all();
             moved[at] = -3.0;
-            let settled = tiles.quiescent_tiles(&zero, &moved, |_| 0.5);
+            let settled = tiles.quiescent_tiles(&zero, &moved, 0.99, |_| 0.5);
             assert_eq!(settled, all.iter().copied().filter(|other| *other != tile).collect::<Vec<_>>(), "{point:?}");
-            assert_eq!(tiles.quiescent_tiles(&moved, &zero, |_| 0.5), all);
+            assert_eq!(tiles.quiescent_tiles(&moved, &zero, 0.99, |_| 0.5), all);
             assert_eq!(tiles.largest, 3.0, "{point:?}");
             moved[at] = 0.0;
         }
@@ -109,8 +109,8 @@ fn the_recent_largest_displacement_is_forgotten_little_by_little() {
     tiles.wake_all();
     tiles.largest = 2.0;
     for look in 1..400 {
-        tiles.quiescent_tiles(&zero, &zero, |_| 0.5);
-        assert!((tiles.largest - 2.0 * FORGET.powi(look)).abs() < 1e-9, "{look}: {}", tiles.largest);
+        tiles.quiescent_tiles(&zero, &zero, 0.99, |_| 0.5);
+        assert!((tiles.largest - 2.0 * 0.99_f64.powi(look)).abs() < 1e-9, "{look}: {}", tiles.largest);
     }
     // A hundredth of it after some seconds.
     assert!(tiles.largest < 0.04);
