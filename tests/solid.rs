@@ -916,12 +916,12 @@ fn regions_of_volume_elements_tell_the_material() {
         let Body::Solid(aligned) = region("0.005").body else { panic!() };
         let count = |factor: f64| aligned.weights().iter().filter(|weight| (*weight - factor).abs() < 1e-6).count();
         assert_eq!((count(5.0), count(1.0)), (64, 448), "{ending}");
-        // Cells across its faces have the power of their part.
+        // Cells across its faces have a mean of the factors.
         let Body::Solid(coarse) = region("0.008").body else { panic!() };
-        let (sum, within) = coarse.weights().iter().fold((0.0, 0.0), |(sum, within), weight| {
-            (sum + weight.max(1e-9).ln().max(0.0) / 5_f64.ln(), within + f64::from(u8::from(*weight > 1.0)))
-        });
-        assert!(within > 8.0 && (sum * 0.512 / 8.0 - 1.0).abs() < 0.02, "{ending}: {sum} of {within}");
+        let part = |weight: &f64| (weight.powf(-0.2) - 1.0) / (5_f64.powf(-0.2) - 1.0);
+        let parts: Vec<f64> = coarse.weights().iter().filter(|weight| **weight > 1.0).map(part).collect();
+        let volume = parts.iter().sum::<f64>() * 0.512;
+        assert!(parts.len() > 8 && (volume / 8.0 - 1.0).abs() < 0.02, "{ending}: {volume} of {}", parts.len());
         let refused = |inclusion: &str| scene(inclusion, "0.005").unwrap_err();
         let unknown = refused("group = \"lumps\"");
         assert_eq!(unknown.field, "inclusion[0].group", "{unknown}");

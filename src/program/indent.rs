@@ -12,6 +12,7 @@ use palpate_session::indentation::{Indentation, Indented};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Body;
+use palpate_tissue::scheme::Oscillator;
 
 use super::{Failure, clock_s, say, with_progress, write_file};
 
@@ -106,7 +107,9 @@ pub(crate) fn run(
     for warning in &indented.summary.warnings {
         say!("palpate: warning: {warning}");
     }
-    if let Some(depth_m) = indented.gives_way_at_m() {
+    // Where the tip turns, a force with branches relaxes.
+    let turns_m = indented.curve.last().map(|row| row.depth_m).filter(|_| Oscillator::of(&model.scene).relaxes());
+    if let Some(depth_m) = indented.gives_way_at_m().filter(|depth_m| Some(*depth_m) != turns_m) {
         say!(
             "palpate: warning: the tissue gives way at a depth of {:.2} mm, where the force falls: this tip presses it no deeper \
              without a jump. Use --tip sphere, a larger --radius-mm, or a smaller --depth-mm",

@@ -74,9 +74,7 @@ impl Indented {
     /// pressure a solid has no equilibrium from there on, until it has found another shape.
     pub fn gives_way_at_m(&self) -> Option<f64> {
         let mut largest_n = 0.0_f64;
-        // Where the tip turns, a force with branches relaxes.
-        let (_, moving) = self.curve.split_last()?;
-        let fallen = moving.iter().find(|row| {
+        let fallen = self.curve.iter().find(|row| {
             largest_n = largest_n.max(row.loading_n);
             row.loading_n < (1.0 - GIVES_WAY) * largest_n
         });

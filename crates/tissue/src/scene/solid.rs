@@ -41,6 +41,12 @@ use slowest::SlowestVibration;
 /// Largest Poisson's ratio. Towards ½ the number of substeps grows without bound.
 const MAX_POISSON: f64 = 0.495;
 
+/// The power of the mean of the factors in a cube that an inclusion fills in part; 0 would be the geometric mean, −1 the harmonic one.
+/// With it a sharp lump is as stiff as its size says: one of 10 mm across and five times as stiff, 8 to 15 mm deep in cubes of 2.5 to
+/// 5 mm, makes a block stiffer under a disc by what a body-fitted solution says, within 1.5 %; the geometric mean is up to 3 % too
+/// stiff, the arithmetic one 6 %.
+const MIXING: f64 = -0.2;
+
 /// Places along each side of a cube at which an inclusion's factor is looked up.
 const LOOKS: usize = 4;
 
@@ -251,9 +257,7 @@ impl Solid {
         &self.layers
     }
 
-    /// Returns the solid with inclusions, in place of those that it had. A cube's factor is the geometric mean over it,
-    /// so that a sharp lump is as stiff as its size says. (A lump of 10 mm across and five times as stiff, 10 mm deep in
-    /// cubes of 2.5 to 5 mm: within 2 % of the truth; the arithmetic mean is 6 % too stiff.)
+    /// Returns the solid with inclusions, in place of those that it had. A cube's factor is a mean over it ([`MIXING`]).
     ///
     /// # Errors
     /// Refuses more than 256 inclusions, a group that is no region of the file, a factor beyond 0.01 to 100, and what reaches no cube;
@@ -285,7 +289,7 @@ impl Solid {
             let mut reaches = false;
             for (at, part) in parts {
                 if weights[at] > 0.0 && part > 0.0 {
-                    factors[at] *= libm::pow(inclusion.stiffness_factor, part);
+                    factors[at] *= mixed(inclusion.stiffness_factor, part);
                     reaches = true;
                 }
             }
@@ -547,6 +551,11 @@ impl BodyKind for Solid {
         self.gravity.check()?;
         self.material.check()
     }
+}
+
+/// Returns the factor of E of a cube of which `part` has a factor.
+fn mixed(factor: f64, part: f64) -> f64 {
+    libm::pow(part * libm::pow(factor, MIXING) + (1.0 - part), 1.0 / MIXING)
 }
 
 impl Inclusion {
