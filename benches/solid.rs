@@ -62,7 +62,7 @@ fn block(size_m: DVec3, cell_m: f64, nu: f64, turn: DQuat, more: &str) -> Arc<Mo
         "[solid]\nfile = \"block.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
          fixed = [{{ plane_m = [0, 0, 0], normal = {normal:?}, within_m = 0.0 }}]\n\
          [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = {nu:?}\ndamping_per_s = 100\n{more}\n\
-         [stepping]\nintegrator = \"central\"\nsubsteps = {}\n[sleep]\ntolerance = 0\n",
+         [stepping]\nintegrator = \"central\"\nprecision = \"f32\"\nsubsteps = {}\n[sleep]\ntolerance = 0\n",
         substeps(cell_m, nu)
     );
     let scene = Scene::parse_in(folder.path(), "block", &text, &[], &Limits::default()).unwrap();

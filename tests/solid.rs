@@ -918,7 +918,7 @@ fn regions_of_volume_elements_tell_the_material() {
         assert_eq!((count(5.0), count(1.0)), (64, 448), "{ending}");
         // Cells across its faces have a mean of the factors.
         let Body::Solid(coarse) = region("0.008").body else { panic!() };
-        let part = |weight: &f64| (weight.powf(-0.2) - 1.0) / (5_f64.powf(-0.2) - 1.0);
+        let part = |weight: &f64| (weight.powf(-0.3) - 1.0) / (5_f64.powf(-0.3) - 1.0);
         let parts: Vec<f64> = coarse.weights().iter().filter(|weight| **weight > 1.0).map(part).collect();
         let volume = parts.iter().sum::<f64>() * 0.512;
         assert!(parts.len() > 8 && (volume / 8.0 - 1.0).abs() < 0.02, "{ending}: {volume} of {}", parts.len());
