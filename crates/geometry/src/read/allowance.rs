@@ -43,6 +43,11 @@ impl<'a> MemoryAllowance<'a> {
         Ok(())
     }
 
+    /// Returns how much memory is taken.
+    pub(super) fn taken(&self) -> usize {
+        self.taken
+    }
+
     /// Gives memory back.
     pub(super) fn give_back(&mut self, bytes: usize) {
         self.taken = self.taken.saturating_sub(bytes);

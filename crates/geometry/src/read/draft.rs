@@ -15,7 +15,10 @@ use crate::{Element, Group, MeshError, Problem, TriangleMesh, Unit, VolumeRegion
 const GROUPS: usize = 4096;
 
 /// Maximum number of regions of a file that are kept.
-const REGIONS: usize = 256;
+pub(super) const REGIONS: usize = 256;
+
+/// Memory for making a region's surface, bytes for each corner of its faces: its vertex, the number of that, and its triangle.
+const REGION_CORNER: usize = 160;
 
 /// Marks a vertex that is dropped.
 const NONE: u32 = u32::MAX;
@@ -207,7 +210,8 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a volume element by its corners, to groups of vertices and to the regions with the same names; further nodes of curved ones are ignored.
+    /// Adds a volume element by its corners, to groups of vertices and to the regions with the same names; further nodes of curved ones
+    /// are ignored.
     pub(super) fn cell(&mut self, cell: Cell, nodes: &[i64], groups: &[usize]) -> Result<(), Problem> {
         if self.volume.len() >= self.limits.triangles {
             return Err(Problem::TooLarge { what: "volume elements", limit: self.limits.triangles });
@@ -274,24 +278,27 @@ impl<'l> Draft<'l> {
                 self.notes.push(format!("Regions beyond the first {REGIONS} are left out."));
                 break;
             }
+            let before = self.allowance.taken();
             let part = volume.part(cells.iter().map(|(cell, _)| *cell), &mut self.allowance)?;
             let faces = part.outer_surface(&self.vertices, &mut self.allowance)?.faces;
             let mut region = VolumeRegion { name: self.groups[cells[0].1 as usize].name.clone(), ..Default::default() };
-            let mut number: BTreeMap<u32, u32> = BTreeMap::new();
+            self.allowance.take(REGION_CORNER * faces.iter().map(Vec::len).sum::<usize>())?;
+            let mut numbers: BTreeMap<u32, u32> = BTreeMap::new();
+            let mut number = |vertex: &u32| {
+                *numbers.entry(*vertex).or_insert_with(|| {
+                    region.vertices_m.push(self.vertices[*vertex as usize]);
+                    region.vertices_m.len() as u32 - 1
+                })
+            };
             for face in faces {
-                let corners: Vec<u32> = face
-                    .iter()
-                    .map(|vertex| {
-                        *number.entry(*vertex).or_insert_with(|| {
-                            region.vertices_m.push(self.vertices[*vertex as usize]);
-                            region.vertices_m.len() as u32 - 1
-                        })
-                    })
-                    .collect();
-                for after in 2..corners.len() {
-                    self.allowance.push(&mut region.triangles, [corners[0], corners[after - 1], corners[after]])?;
-                }
+                let corners: Vec<u32> = face.iter().map(&mut number).collect();
+                region.triangles.extend((2..corners.len()).map(|at| [corners[0], corners[at - 1], corners[at]]));
             }
+            region.vertices_m.shrink_to_fit();
+            region.triangles.shrink_to_fit();
+            // Only the surface is kept.
+            self.allowance.give_back(self.allowance.taken().saturating_sub(before));
+            self.allowance.take(size_of_val(&*region.vertices_m) + size_of_val(&*region.triangles))?;
             regions.push(region);
         }
         Ok(regions)

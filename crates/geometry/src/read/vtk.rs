@@ -4,8 +4,10 @@
 //! `vtkio` is not used: it allocates as much memory as the counts in a file demand, decompresses without a limit and
 //! does not say which element is wrong.
 
+use std::collections::BTreeMap;
+
 use super::allowance::MemoryAllowance;
-use super::draft::Draft;
+use super::draft::{Draft, REGIONS as REGIONS_KEPT};
 use super::source::{Order, Scalar, Source, shown, words};
 use super::volume::Cell;
 use crate::{Element, MeshError, Problem};
@@ -85,6 +87,27 @@ impl Faces {
         lists.map(|list| size_of_val(list.as_slice())).sum()
     }
 
+    /// Returns the group of the region of a cell, if it is a volume element. `groups` are those of the values so far; values
+    /// beyond the first [`REGIONS_KEPT`] have none.
+    fn region(
+        &self,
+        kind: i64,
+        number: u64,
+        groups: &mut BTreeMap<i64, usize>,
+        draft: &mut Draft<'_>,
+    ) -> Result<Option<usize>, Problem> {
+        let is_volume = matches!(kind, 10..=14 | 24..=27 | 29 | 31..=33 | 37 | 71..=74 | 78..=81);
+        let Some((name, values)) = self.regions.as_ref().filter(|_| is_volume) else { return Ok(None) };
+        let Some(value) = usize::try_from(number).ok().and_then(|number| values.get(number)) else { return Ok(None) };
+        if !groups.contains_key(value) {
+            if groups.len() == REGIONS_KEPT {
+                return Ok(None);
+            }
+            groups.insert(*value, draft.group(&format!("{name} {value}"))?);
+        }
+        Ok(groups.get(value).copied())
+    }
+
     /// Adds the faces to a draft. Their vertex indices are relative to the vertex `first` of the draft.
     pub(super) fn add(&self, file: &str, first: usize, draft: &mut Draft<'_>) -> Result<(), MeshError> {
         let fail = |number, problem| MeshError {
@@ -105,33 +128,21 @@ impl Faces {
             corners.extend(list.map_err(|problem| fail(number, problem))?.iter().map(|at| at.saturating_add(first)));
             draft.strip(&corners, &[]).map_err(|problem| fail(number, problem))?;
         }
+        let mut groups: BTreeMap<i64, usize> = BTreeMap::new();
         for ((number, list), kind) in self.grid.lists().zip(&self.types) {
             corners.clear();
             corners.extend(list.map_err(|problem| fail(number, problem))?.iter().map(|at| at.saturating_add(first)));
-            let region =
-                cell_region(self.regions.as_ref(), *kind, number, draft).map_err(|problem| fail(number, problem))?;
+            let region = self.region(*kind, number, &mut groups, draft).map_err(|problem| fail(number, problem))?;
             cell(*kind, &mut corners, region.as_slice(), draft).map_err(|problem| fail(number, problem))?;
+        }
+        if groups.len() == REGIONS_KEPT {
+            draft.notes.push(format!("Regions beyond the first {REGIONS_KEPT} are left out."));
         }
         if self.grid.ends.len() != self.types.len() {
             let message = format!("{} cells, but {} types", self.grid.ends.len(), self.types.len());
             return Err(fail(self.types.len() as u64, Problem::Syntax { message }));
         }
         Ok(())
-    }
-}
-
-/// Returns the group of a volume element's region.
-fn cell_region(
-    regions: Option<&(String, Vec<i64>)>,
-    kind: i64,
-    number: u64,
-    draft: &mut Draft<'_>,
-) -> Result<Option<usize>, Problem> {
-    let is_volume = matches!(kind, 10..=14 | 24..=27 | 29 | 31..=33 | 37 | 71..=74 | 78..=81);
-    let of = |(name, list): &(String, Vec<i64>)| Some((name.clone(), *list.get(usize::try_from(number).ok()?)?));
-    match regions.and_then(of) {
-        Some((name, value)) if is_volume => draft.group(&format!("{name} {value}")).map(Some),
-        _ => Ok(None),
     }
 }
 
