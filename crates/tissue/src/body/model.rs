@@ -32,7 +32,7 @@ pub struct Model {
     /// Where the points are in memory, and how they differ.
     pub(crate) places: Places,
     /// ω_b = √((λ + K″)/m), rad/s, for a point of the reference mass m; λ is the largest eigenvalue of the
-    /// springs' stiffness, K″ that of an anchor spring ([`Oscillator::omega_bound_per_s`]). No vibration is
+    /// springs' stiffness with branches, K″ that of an anchor spring ([`Oscillator::omega_bound_per_s`]). No vibration is
     /// faster, under any deformation.
     pub omega_bound_per_s: f64,
     /// The scheme and the substep with which a tissue begins. The guard may halve the substep of one tissue

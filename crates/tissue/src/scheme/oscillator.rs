@@ -81,10 +81,11 @@ impl Oscillator {
         self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
     }
 
-    /// Returns ω_b = √((λ + K″)/m), rad/s: an upper bound of the frequency of every vibration, under any
-    /// deformation. (ω² is an eigenvalue of stiffness divided by mass, and that of a sum is at most the sum of
-    /// the largest ones.)
+    /// Returns ω_b = √((λ·(1 + Σγ) + K″)/m), rad/s, with γ of the branches: an upper bound of the frequency of every
+    /// vibration, under any deformation. (ω² is an eigenvalue of stiffness divided by mass, and that of a sum is at most the sum
+    /// of the largest ones.)
     pub fn omega_bound_per_s(&self) -> f64 {
-        ((self.spring_stiffness_n_per_m + self.anchor_stiffness_n_per_m) / self.mass_kg).sqrt()
+        let whole = 1.0 + self.branches.iter().map(|branch| branch.stiffness).sum::<f64>();
+        ((self.spring_stiffness_n_per_m * whole + self.anchor_stiffness_n_per_m) / self.mass_kg).sqrt()
     }
 }

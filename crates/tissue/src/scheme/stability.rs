@@ -110,7 +110,7 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, oscillator: &Oscilla
 /// what makes them as accurate as they promise:
 ///
 /// dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤ 1, half of its bound 2
-/// (W + 2g < 4 with W = 0). A viscous tissue gets at least [`stable_substeps`]. Saturates at `u32::MAX`.
+/// (W + 2g < 4 with W = 0). A viscous tissue, and one with branches, gets at least [`stable_substeps`]. Saturates at `u32::MAX`.
 pub fn substeps(integrator: Integrator, step_s: f64, oscillator: &Oscillator) -> u32 {
     let decay_s = 2.0 * oscillator.mass_kg / oscillator.damping_n_s_per_m;
     let omega = oscillator.omega_bound_per_s();
@@ -123,7 +123,8 @@ pub fn substeps(integrator: Integrator, step_s: f64, oscillator: &Oscillator) ->
         Bound::Turn => turn(),
         Bound::TurnAndLag => turn().max(lag()),
     };
-    if oscillator.viscous_time_s > 0.0 { accurate.max(stable()) } else { accurate }
+    let is_elastic = oscillator.viscous_time_s == 0.0 && !oscillator.relaxes();
+    if is_elastic { accurate } else { accurate.max(stable()) }
 }
 
 /// Returns the fewest substeps, at least 1, with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps; in s,
@@ -137,7 +138,7 @@ pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
 mod tests {
     #![allow(clippy::cast_precision_loss)]
     use super::*;
-    use crate::scene::{Named, Springs, largest_stiffness_of_a_sheet_n_per_m};
+    use crate::scene::{MaxwellBranch, Named, Springs, largest_stiffness_of_a_sheet_n_per_m};
     use crate::scheme::Coefficients;
 
     /// Every scheme.
@@ -286,6 +287,32 @@ mod tests {
                 let scheme = Scheme::fit(integrator, oscillator.scaled(substep_s));
                 let stiffness = oscillator.scaled_spring_stiffness(substep_s);
                 assert!(is_stable(&scheme, stiffness), "{integrator:?} {viscous_time_s}: {substeps}");
+            }
+        }
+    }
+
+    #[test]
+    fn two_step_schemes_get_enough_substeps_for_any_branch() {
+        for stiffness in [0.1, 3.0, 1e3] {
+            for time_s in [1e-3, 0.03, 100.0] {
+                for viscous_time_s in [0.0, 3e-5] {
+                    let branch = MaxwellBranch { stiffness, time_s };
+                    let oscillator = Oscillator {
+                        mass_kg: 1e-5,
+                        damping_n_s_per_m: 2e-4,
+                        anchor_stiffness_n_per_m: 0.0,
+                        spring_stiffness_n_per_m: 300.0,
+                        viscous_time_s,
+                        branches: [branch, MaxwellBranch::default(), branch],
+                    };
+                    for integrator in [Integrator::Stormer, Integrator::Central, Integrator::Lagged] {
+                        let substeps = substeps(integrator, 1e-3, &oscillator);
+                        let substep_s = 1e-3 / f64::from(substeps);
+                        let scheme = Scheme::fit(integrator, oscillator.scaled(substep_s));
+                        let fastest = oscillator.scaled_spring_stiffness(substep_s);
+                        assert!(is_stable(&scheme, fastest), "{integrator:?} {branch:?} {viscous_time_s}: {substeps}");
+                    }
+                }
             }
         }
     }
