@@ -9,9 +9,9 @@ use glam::DVec3;
 use super::Session;
 use super::scene_report::Prospect;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::Named;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::{MaxwellBranch, Named};
 use palpate_tissue::scheme::{Oscillator, Relaxation};
 use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
@@ -174,9 +174,9 @@ impl fmt::Display for CheckReport {
             )?;
         }
         if sheet.relaxes() {
-            let branches = || sheet.branches.iter().filter(|branch| branch.stiffness > 0.0);
-            let at_once = 1.0 + branches().map(|branch| branch.stiffness).sum::<f64>();
-            let times: Vec<String> = branches().map(|branch| format!("{} s", branch.time_s)).collect();
+            let branches = sheet.branches.iter().filter(|branch| branch.stiffness > 0.0);
+            let at_once = MaxwellBranch::whole(&sheet.branches);
+            let times: Vec<String> = branches.map(|branch| format!("{} s", branch.time_s)).collect();
             writeln!(
                 f,
                 "branches      {at_once:.3} times as stiff at once; what they hold falls by e in {}",

@@ -15,7 +15,7 @@ use crate::{Element, Group, MeshError, Problem, TriangleMesh, Unit, VolumeRegion
 const GROUPS: usize = 4096;
 
 /// Maximum number of regions of a file that are kept.
-pub(super) const REGIONS: usize = 256;
+pub(super) const MAX_REGIONS: usize = 256;
 
 /// Memory for making a region's surface, bytes for each corner of its faces: its vertex, the number of that, and its triangle.
 const REGION_CORNER: usize = 160;
@@ -274,8 +274,8 @@ impl<'l> Draft<'l> {
         of_cells.sort_unstable_by_key(|(cell, group)| (*group, *cell));
         let mut regions = Vec::new();
         for cells in of_cells.chunk_by(|a, b| a.1 == b.1) {
-            if regions.len() == REGIONS {
-                self.notes.push(format!("Regions beyond the first {REGIONS} are left out."));
+            if regions.len() == MAX_REGIONS {
+                self.notes.push(format!("Regions beyond the first {MAX_REGIONS} are left out."));
                 break;
             }
             let before = self.allowance.taken();

@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 
 use super::allowance::MemoryAllowance;
-use super::draft::{Draft, REGIONS as REGIONS_KEPT};
+use super::draft::{Draft, MAX_REGIONS};
 use super::source::{Order, Scalar, Source, shown, words};
 use super::volume::Cell;
 use crate::{Element, MeshError, Problem};
@@ -88,7 +88,7 @@ impl Faces {
     }
 
     /// Returns the group of the region of a cell, if it is a volume element. `groups` are those of the values so far; values
-    /// beyond the first [`REGIONS_KEPT`] have none.
+    /// beyond the first [`MAX_REGIONS`] have none.
     fn region(
         &self,
         kind: i64,
@@ -100,7 +100,7 @@ impl Faces {
         let Some((name, values)) = self.regions.as_ref().filter(|_| is_volume) else { return Ok(None) };
         let Some(value) = usize::try_from(number).ok().and_then(|number| values.get(number)) else { return Ok(None) };
         if !groups.contains_key(value) {
-            if groups.len() == REGIONS_KEPT {
+            if groups.len() == MAX_REGIONS {
                 return Ok(None);
             }
             groups.insert(*value, draft.group(&format!("{name} {value}"))?);
@@ -135,8 +135,8 @@ impl Faces {
             let region = self.region(*kind, number, &mut groups, draft).map_err(|problem| fail(number, problem))?;
             cell(*kind, &mut corners, region.as_slice(), draft).map_err(|problem| fail(number, problem))?;
         }
-        if groups.len() == REGIONS_KEPT {
-            draft.notes.push(format!("Regions beyond the first {REGIONS_KEPT} are left out."));
+        if groups.len() == MAX_REGIONS {
+            draft.notes.push(format!("Regions beyond the first {MAX_REGIONS} are left out."));
         }
         if self.grid.ends.len() != self.types.len() {
             let message = format!("{} cells, but {} types", self.grid.ends.len(), self.types.len());

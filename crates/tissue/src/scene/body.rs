@@ -30,6 +30,18 @@ pub struct MaxwellBranch {
     pub time_s: f64,
 }
 
+impl MaxwellBranch {
+    /// Returns whether there is a branch among these.
+    pub fn any(branches: &[Self]) -> bool {
+        branches.iter().any(|branch| branch.stiffness > 0.0)
+    }
+
+    /// Returns 1 + Σγ: how many times as stiff the branches make the springs at once.
+    pub fn whole(branches: &[Self]) -> f64 {
+        1.0 + branches.iter().map(|branch| branch.stiffness).sum::<f64>()
+    }
+}
+
 impl Default for MaxwellBranch {
     /// No branch.
     fn default() -> Self {

@@ -653,13 +653,24 @@ impl FixedVertices {
 /// # Errors
 /// Refuses a name that no group has; `field` is the key that the refusal gives.
 pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> Result<&'g Group> {
-    groups.iter().find(|group| group.name == name).ok_or_else(|| {
-        let meant = did_you_mean(name, groups.iter().map(|group| group.name.as_str()));
-        let names: Vec<&str> = groups.iter().map(|group| group.name.as_str()).take(8).collect();
-        let all = if names.is_empty() { "it has none".to_owned() } else { format!("it has {}", names.join(", ")) };
-        let message = format!("the mesh has no group `{}`{meant}; {all}", excerpt(name));
-        Refusal::new(Reason::WrongKind, field, message)
-    })
+    let names = || groups.iter().map(|group| group.name.as_str());
+    groups
+        .iter()
+        .find(|group| group.name == name)
+        .ok_or_else(|| unknown_name(field, "the mesh has no group", name, names))
+}
+
+/// Returns the refusal of a name that is none of `names`; `lacks` says what there is none of.
+pub(super) fn unknown_name<'n, N: Iterator<Item = &'n str>>(
+    field: &str,
+    lacks: &str,
+    name: &str,
+    names: impl Fn() -> N,
+) -> Refusal {
+    let meant = did_you_mean(name, names());
+    let first: Vec<&str> = names().take(8).collect();
+    let all = if first.is_empty() { "it has none".to_owned() } else { format!("it has {}", first.join(", ")) };
+    Refusal::new(Reason::WrongKind, field, format!("{lacks} `{}`{meant}; {all}", excerpt(name)))
 }
 
 impl MeshShape {

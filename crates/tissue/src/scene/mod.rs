@@ -527,7 +527,7 @@ impl Scene {
                 "stormer is for [solid], which has no anchor springs"
             }
             Integrator::Rk4 | Integrator::Exponential2 | Integrator::Exponential3 | Integrator::Exponential4
-                if self.body.kind().branches().iter().any(|branch| branch.stiffness > 0.0) =>
+                if MaxwellBranch::any(&self.body.kind().branches()) =>
             {
                 "leaves branches out: take stormer, central or lagged"
             }

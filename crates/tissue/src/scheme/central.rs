@@ -182,10 +182,9 @@ impl<const KEPT: usize> TwoStep<KEPT> {
     fn weights(&self) -> [f64; 1 + LONGEST] {
         let mut weights = [0.0; 1 + LONGEST];
         weights[..=HISTORY].copy_from_slice(&self.springs);
-        weights[0] *= BranchFilter::whole(&self.filters);
-        for (weight, filter) in weights[1 + HISTORY..].iter_mut().zip(&self.filters) {
-            *weight = -self.springs[0] * filter.pull;
-        }
+        let (now, filtered) = BranchFilter::weights(self.springs[0], &self.filters);
+        weights[0] = now;
+        weights[1 + HISTORY..].copy_from_slice(&filtered);
         weights
     }
 }

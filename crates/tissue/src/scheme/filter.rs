@@ -37,6 +37,11 @@ impl BranchFilter {
         1.0 + filters.iter().map(|filter| filter.pull).sum::<f64>()
     }
 
+    /// Returns the weights of N and of each s in `weight` times N + Σ γ·(N − z).
+    pub(super) fn weights<const N: usize>(weight: f64, filters: &[Self; N]) -> (f64, [f64; N]) {
+        (weight * Self::whole(filters), filters.map(|filter| -weight * filter.pull))
+    }
+
     /// Returns the weights of N and M₋, and of each s, in the mean of the branches' force now and a substep ago.
     pub(super) fn means<const N: usize>(filters: &[Self; N]) -> ([f64; 2], [f64; N]) {
         let before = 1.0 + filters.iter().map(|filter| filter.pull / filter.keeps).sum::<f64>();

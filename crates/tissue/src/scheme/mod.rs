@@ -243,9 +243,9 @@ impl Scheme {
         let mut weights: Vec<f64> = viscous.collect();
         if self.kept_of_springs() > self.history() {
             // Viscosity acts on the branches as well.
-            let (filters, of_whole) = (of.branches.map(BranchFilter::of), 1.0 + weights[0]);
-            weights[0] = of_whole * BranchFilter::whole(&filters) - 1.0;
-            weights.extend(filters.map(|filter| -of_whole * filter.pull));
+            let (now, filtered) = BranchFilter::weights(1.0 + weights[0], &of.branches.map(BranchFilter::of));
+            weights[0] = now - 1.0;
+            weights.extend(filtered);
         }
         weights
     }

@@ -60,7 +60,7 @@ impl Coefficients {
 impl Oscillator {
     /// Returns whether a part of the springs' force relaxes.
     pub fn relaxes(&self) -> bool {
-        self.branches.iter().any(|branch| branch.stiffness > 0.0)
+        MaxwellBranch::any(&self.branches)
     }
 
     /// Returns the coefficients for a substep of length dt = `substep_s`, s.
@@ -85,7 +85,7 @@ impl Oscillator {
     /// vibration, under any deformation. (ω² is an eigenvalue of stiffness divided by mass, and that of a sum is at most the sum
     /// of the largest ones.)
     pub fn omega_bound_per_s(&self) -> f64 {
-        let whole = 1.0 + self.branches.iter().map(|branch| branch.stiffness).sum::<f64>();
+        let whole = MaxwellBranch::whole(&self.branches);
         ((self.spring_stiffness_n_per_m * whole + self.anchor_stiffness_n_per_m) / self.mass_kg).sqrt()
     }
 }

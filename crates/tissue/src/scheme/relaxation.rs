@@ -88,7 +88,7 @@ impl Relaxation {
 
 /// Returns the time in which a free tissue with branches creeps back by a factor of e, s: it is at most τ·(1 + Σγ).
 fn creep_s(branches: &[MaxwellBranch]) -> f64 {
-    let whole = 1.0 + branches.iter().map(|branch| branch.stiffness).sum::<f64>();
+    let whole = MaxwellBranch::whole(branches);
     let creeping = branches.iter().filter(|branch| branch.stiffness > 0.0);
     creeping.map(|branch| branch.time_s * whole).fold(0.0, f64::max)
 }

@@ -10,10 +10,10 @@ use palpate_geometry::{Group, TriangleMesh, prepare, report};
 
 use super::fixed::{FixedPart, along_axis};
 use crate::limits::Limits;
-use crate::scene::mesh::{MeshShape, group_named};
+use crate::scene::mesh::{MeshShape, group_named, unknown_name};
 use crate::scene::shown::{findings_of, to_repair};
 use crate::shape::{CellPlace, Deepest, Extent, PointId, PointName, RestShape, ShownShape};
-use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, legible};
+use palpate_refusal::{Reason, Refusal, Result, legible};
 
 /// The number of a corner of the lattice that is no point.
 const NO_POINT: u32 = u32::MAX;
@@ -202,17 +202,13 @@ impl SolidShape {
     pub(super) fn region_parts(&self, name: &str, field: &str) -> Result<Vec<(usize, f64)>> {
         let regions = &self.source.regions;
         let Some(region) = regions.iter().find(|region| region.name == name) else {
+            if regions.is_empty() {
+                let message = "is for a file with volume elements in named groups; in others an inclusion of a solid is a ball, \
+                               with centre_m and radius_m";
+                return Err(Refusal::new(Reason::WrongKind, field, message));
+            }
             let names = || regions.iter().map(|region| region.name.as_str());
-            let message = match regions.as_slice() {
-                [] => "is for a file with volume elements in named groups; in others an inclusion of a solid is a ball, with \
-                       centre_m and radius_m"
-                    .to_owned(),
-                _ => {
-                    let (meant, all) = (did_you_mean(name, names()), names().take(8).collect::<Vec<_>>().join(", "));
-                    format!("the file has no region `{}`{meant}; it has {all}", excerpt(name))
-                }
-            };
-            return Err(Refusal::new(Reason::WrongKind, field, message));
+            return Err(unknown_name(field, "the file has no region", name, names));
         };
         let of_region = filled(&region.vertices_m, &region.triangles, &self.lattice).parts;
         let share = |(region, whole): (&f32, &f32)| f64::from(*region / whole.max(*region).max(f32::MIN_POSITIVE));

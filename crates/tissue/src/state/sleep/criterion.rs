@@ -18,11 +18,11 @@ use crate::tools::prescribed::Prescribed;
 
 /// Returns the factor by which the recent largest displacement decays from one check of the tiles to the next: by a hundredth, or
 /// slower than a tissue with branches creeps back, which would otherwise stay as large as its memory.
-fn forget(model: &Model) -> f64 {
+fn forget(relaxation: &Relaxation, rate_hz: f64) -> f64 {
     const USUAL: f64 = 0.99;
     const TIMES_CREEP: f64 = 8.0;
-    let creep_s = TIMES_CREEP * Relaxation::of(&model.scene).creep_s();
-    let check_s = CHECK_STEPS as f64 / model.scene.stepping.rate_hz;
+    let creep_s = TIMES_CREEP * relaxation.creep_s();
+    let check_s = CHECK_STEPS as f64 / rate_hz;
     if creep_s > 0.0 { USUAL.max(libm::exp(-check_s / creep_s)) } else { USUAL }
 }
 
@@ -123,7 +123,8 @@ pub(crate) fn put_to_sleep<T: Real>(
     // In the scheme's units of force and velocity: the anchor springs, drag, and the stiffness that pulls a point back.
     let sheet = Oscillator::of(&model.scene);
     let Coefficients { anchor: anchor_stiffness, damping: drag, .. } = sheet.scaled(plan.substep_s);
-    let restoring = Relaxation::of(&model.scene).scaled(plan.substep_s);
+    let relaxation = Relaxation::of(&model.scene);
+    let restoring = relaxation.scaled(plan.substep_s);
     // A displacement is known to half its last digit. The spring force that this rounding causes moves
     // nothing: it differs from point to point, and a point between its neighbours yields by as little. Nor
     // does a substep move anything by less than that digit, unless the scheme keeps the rounding error.
@@ -135,7 +136,7 @@ pub(crate) fn put_to_sleep<T: Real>(
     let unknown = half_digit * rough.scaled_spring_stiffness(plan.substep_s) + creep * drag;
     let creep = creep * tiles.largest;
     let slow = |epsilon: f64| (epsilon * restoring.sqrt()).max(creep);
-    let settled = tiles.quiescent_tiles(&state.u, &state.d, forget(model), slow);
+    let settled = tiles.quiescent_tiles(&state.u, &state.d, forget(&relaxation, model.scene.stepping.rate_hz), slow);
     let epsilon = tiles.epsilon();
     let scale = plan.scheme.spring_scale();
     let forces = Forces {
