@@ -16,6 +16,8 @@ const TICK_MS = 10;
  * call.
  */
 const PAGE_MS = 2000;
+/** A worker that was stopped for longer than this stops sending poses: the server ends a touch after 250 ms. */
+const MAX_STOP_MS = 150;
 /** Largest datagram, bytes. */
 const MAX_BYTES = 1024;
 /** Largest message of the stream, bytes. */
@@ -60,6 +62,8 @@ export interface Heard {
   networkMs?: number;
   sample?: Sample;
   rejection?: Pick<Rejection, "reason" | "message">;
+  /** If poses have stopped, the time of the last one, ms since the Unix epoch. */
+  lastPoseMs?: number;
   /** Whether the session has ended. */
   isOver?: boolean;
 }
@@ -117,9 +121,10 @@ class DatagramWorker {
   }
 
   lead(led: Led): void {
+    this.ledMs = performance.now();
+    if (!this.led) this.posedMs = this.ledMs;
     if (this.led?.from !== led.from) this.poses = new Poses(this.order.tool, led.from);
     this.led = led;
-    this.ledMs = performance.now();
     this.pose(this.ledMs);
   }
 
@@ -130,12 +135,13 @@ class DatagramWorker {
   private tick(): void {
     const now = performance.now();
     const carries = this.health.carries(now);
-    if (carries !== this.carries) {
+    const isLate = this.led && now - this.posedMs > MAX_STOP_MS;
+    if (carries !== this.carries || isLate) {
       this.carries = carries;
-      this.tell({});
+      this.tell(isLate ? { lastPoseMs: performance.timeOrigin + this.posedMs } : {});
     }
     // Meanwhile the page sends the poses by calls, and starts anew here later.
-    if (!carries || now - this.ledMs > PAGE_MS) this.rest();
+    if (!carries || isLate || now - this.ledMs > PAGE_MS) this.rest();
     if (this.led && now - this.posedMs >= this.repeatMs) this.pose(now);
     if (this.health.isSilent(now)) this.send([], now);
   }
@@ -218,7 +224,8 @@ class DatagramWorker {
   private tell(heard: Partial<Heard>): void {
     const { sent, came, fellBack } = this.health;
     const counts = { ...this.counted, sent: Number(sent), came: Number(came), fellBack };
-    page.postMessage({ carries: this.carries, counts, networkMs: this.networkMs, ...heard });
+    const lastPoseMs = this.led && !this.carries ? performance.timeOrigin + this.posedMs : undefined;
+    page.postMessage({ carries: this.carries, counts, lastPoseMs, networkMs: this.networkMs, ...heard });
   }
 }
 

@@ -3,9 +3,14 @@
 // datagrams.
 
 import type { Counts, Heard, Led, Order, Word } from "./datagram-worker.js";
-import type { DatagramOffer, Sample } from "./gen/palpate/v1/haptic_pb.js";
+import type { DatagramOffer, Sample, ToolSample } from "./gen/palpate/v1/haptic_pb.js";
 import { isUnimplemented, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
+/**
+ * Poses that stopped for longer than this, until the page learns of it, may have let the server end the touch: it does
+ * after 250 ms.
+ */
+const MAX_GAP_MS = 150;
 /** Longest wait before a session is tried again: a network that blocks datagrams will probably continue to do so. */
 const AVOID_MS = 60_000;
 /**
@@ -24,6 +29,10 @@ export class Datagrams {
   onRejected: (reason: string, message: string) => void = () => {};
   /** Called when `carries` changes. */
   onChange: () => void = () => {};
+  /** Called when the server may have ended the touch because no pose arrived for too long. */
+  onGap: () => void = () => {};
+  /** Called with what each sample says of the tool. */
+  onTool: (sample: ToolSample) => void = () => {};
   networkMs: number | undefined;
   /** Whether datagrams get through. */
   carries = false;
@@ -91,21 +100,24 @@ export class Datagrams {
     worker.postMessage({ url, certificateSha256: offer.certificateSha256.slice(), tool: this.tool } satisfies Order);
   }
 
-  private heard({ carries, counts, networkMs, sample, rejection, isOver }: Heard): void {
+  private heard({ carries, counts, networkMs, sample, rejection, isOver, lastPoseMs }: Heard): void {
     this.now = counts;
     this.networkMs = networkMs;
     if (isOver) return this.failed(counts.came > 0);
     if (sample) this.take(sample);
     if (rejection) this.onRejected(rejection.reason, rejection.message);
-    if (carries === this.carries) return;
+    const changes = carries !== this.carries;
     this.carries = carries;
-    this.onChange();
+    if (lastPoseMs && performance.timeOrigin + performance.now() - lastPoseMs > MAX_GAP_MS) this.onGap();
+    if (changes) this.onChange();
   }
 
   /** Accepts a sample, unless it is from a server that no longer owns the session. */
   private take(sample: Sample): void {
     if (sample.ownershipRevision < this.revision) return;
     this.revision = sample.ownershipRevision;
+    const tool = sample.tools.find(({ tool }) => tool === this.tool);
+    if (tool) this.onTool(tool);
     this.onSample(sample);
   }
 

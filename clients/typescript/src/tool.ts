@@ -6,7 +6,7 @@
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { Datagrams } from "./datagrams.js";
-import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb.js";
+import type { CommandSchema, Sample, ToolSample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Lead, poseOf } from "./poses.js";
 import { backoffMs, describe, isGone, isUnreached, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
@@ -23,6 +23,8 @@ export type Wanted = ({ lead: Lead } | { action: Action }) & { isMoving?: boolea
 
 /** In the tissue's time, without a newer command: a page that vanishes does not keep pressing. */
 const TIME_TO_LIVE_S = 2;
+/** A touch whose last call is longer ago than this may have ended at the server, and begins anew. */
+const MAX_SILENCE_MS = 1500;
 /** Interval between identical commands, well below the time to live. */
 const REPEAT_MS = 100;
 /** Interval between checks for something to send. */
@@ -51,6 +53,11 @@ export class Tool {
   /** The release of the last lease, while the server has not answered it: until then the tool is still taken. */
   private leaving: Promise<void> | undefined;
   private sequence = 0n;
+  /** Sequence of the first command of this touch. */
+  private first: bigint | undefined;
+  private acts = false;
+  /** Whether a release is on its way, after which the touch begins anew. */
+  private beginsAnew = false;
   /** The sequence from which datagrams count, while poses are sent by datagram. */
   private from: bigint | undefined;
   private wanted: ((nowMs: number) => Wanted) | undefined;
@@ -74,6 +81,8 @@ export class Tool {
   ) {
     this.datagrams = new Datagrams(server, sessionId, tool, sampleEverySteps);
     this.datagrams.onChange = () => this.changed();
+    this.datagrams.onGap = () => this.beginAnew();
+    this.datagrams.onTool = (sample) => this.note(sample);
     this.datagrams.onRejected = (reason, message) => {
       if (!["STALE_SEQUENCE", "NOT_HOLDER"].includes(reason)) this.onRefused(message, reason);
     };
@@ -90,6 +99,14 @@ export class Tool {
 
   get touches(): boolean {
     return this.wanted !== undefined;
+  }
+
+  /**
+   * Whether the server acts on this touch. It ends a touch whose commands do not arrive; then the touch begins anew.
+   * Until this is true, a tip belongs beside the tissue: where it begins tells its side of an open surface.
+   */
+  get isActing(): boolean {
+    return this.acts;
   }
 
   /** Takes the tool if it is free. */
@@ -124,6 +141,7 @@ export class Tool {
   /** Begins to touch: takes the tool if needed, and calls `wanted` regularly to learn what the tool should do. */
   async touch(wanted: (nowMs: number) => Wanted): Promise<boolean> {
     this.wanted = wanted;
+    [this.first, this.acts] = [undefined, false];
     this.released = false;
     this.touchedMs = performance.now();
     this.fresh = true;
@@ -177,10 +195,32 @@ export class Tool {
     this.onChange();
   }
 
+  /** Learns from the server's sample whether it acts on this touch. */
+  private note({ acknowledgedSequence, expired }: ToolSample): void {
+    if (!this.wanted || this.first === undefined || acknowledgedSequence < this.first) return;
+    if (this.acts && expired) return this.beginAnew();
+    if (this.acts === !expired) return;
+    this.acts = !expired;
+    this.changed();
+  }
+
+  /** Releases what the server may still hold, and begins the touch anew. */
+  private beginAnew(): void {
+    const { leaseId } = this;
+    if (!leaseId || !this.wanted || this.beginsAnew) return;
+    [this.first, this.acts, this.beginsAnew] = [undefined, false, true];
+    const released = this.send(leaseId, [this.command(undefined, performance.now())]);
+    void released.finally(() => {
+      this.beginsAnew = false;
+      this.changed();
+    });
+  }
+
   /** Sends the action, if that is due. */
   private tick(): void {
-    if (!this.leaseId) return;
+    if (!this.leaseId || this.beginsAnew) return;
     const now = performance.now();
+    if (this.acts && this.from === undefined && now - this.sentMs > MAX_SILENCE_MS) return this.beginAnew();
     const wanted = this.wanted?.(now);
     if (wanted && "lead" in wanted && this.datagrams.carries) return this.leadOn(wanted.lead, now);
     if (this.underWay >= IN_FLIGHT || now < this.waitsUntilMs) return;
@@ -197,6 +237,7 @@ export class Tool {
 
   private leadOn(lead: Lead, now: number): void {
     this.from ??= this.sequence += APART;
+    this.first ??= this.from;
     this.datagrams.lead({ lead, from: this.from });
     // Datagrams keep the lease.
     this.sentMs = now;
@@ -210,6 +251,7 @@ export class Tool {
     const { tool, sequence } = this;
     const command = { tool, sequence, clientTimeNs: BigInt(Math.round(now * 1e6)) };
     if (!wanted) return { ...command, action: { case: "release", value: {} } };
+    this.first ??= sequence;
     const timeToLiveS = TIME_TO_LIVE_S;
     if ("lead" in wanted) {
       return { ...command, clientTimeNs: 0n, timeToLiveS, action: { case: "pose", value: poseOf(wanted.lead) } };
@@ -235,8 +277,10 @@ export class Tool {
   }
 
   private measure(sample: Sample, tookMs: number): void {
-    const tool = sample.tools[0];
-    if (tool && tool.acknowledgedSequence === this.sequence) {
+    const tool = sample.tools.find(({ tool }) => tool === this.tool);
+    if (!tool) return;
+    this.note(tool);
+    if (tool.acknowledgedSequence === this.sequence) {
       this.callMs = Math.max(0, tookMs - Number(tool.serverHoldNs) / 1e6);
     }
   }

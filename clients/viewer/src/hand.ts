@@ -41,7 +41,8 @@ export class Hand {
   private place: Place | undefined;
   private onSurfaceM: Vec3 = [0, 0, 0];
   private leanM: Vec3 = [0, 0, 0];
-  private pressedMs = 0;
+  /** Time from which the tip moves down; undefined while the server does not act on this touch. */
+  private sinksFromMs: number | undefined;
 
   constructor(
     sessionId: string,
@@ -79,7 +80,7 @@ export class Hand {
 
   /** Target depth of the tip, once it has had the time to get there; undefined if no tip is used. */
   get setM(): number | undefined {
-    const hasSunk = performance.now() - this.pressedMs > SINK_MS + SETTLES_MS;
+    const hasSunk = performance.now() - (this.sinksFromMs ?? Infinity) > SINK_MS + SETTLES_MS;
     return this.mode === "tip" && this.tool.touches && hasSunk ? this.strength * this.reach.depthM : undefined;
   }
 
@@ -93,7 +94,7 @@ export class Hand {
     this.place = place;
     this.onSurfaceM = onSurfaceM;
     this.leanM = [0, 0, 0];
-    this.pressedMs = performance.now();
+    this.sinksFromMs = undefined;
     await this.tool.touch((now) => this.wanted(place, now));
   }
 
@@ -127,14 +128,22 @@ export class Hand {
   /** Returns what the tool should do: at the place of the press, or where it has moved to. */
   private wanted(pressed: Place, now: number): Wanted {
     const place = this.place ?? pressed;
-    if (this.mode === "tip") return { lead: this.tip(place, now), isMoving: now - this.pressedMs < SINK_MS };
+    if (this.mode === "tip") {
+      this.sinksFromMs = this.tool.isActing ? (this.sinksFromMs ?? now) : undefined;
+      return { lead: this.tip(place, now), isMoving: this.sunk(now) < 1 };
+    }
     return { action: this.action(place) };
+  }
+
+  /** Returns which part of its way down the tip has gone. */
+  private sunk(now: number): number {
+    return this.sinksFromMs === undefined ? 0 : Math.min(1, (now - this.sinksFromMs) / SINK_MS);
   }
 
   /** Returns the position of the tip at a place: on its way from beside the tissue, or at its depth. */
   private tip({ restM, outward: n }: Place, now: number): Lead {
     const radiusM = this.reach.lengthM;
-    const part = Math.min(1, (now - this.pressedMs) / SINK_MS);
+    const part = this.sunk(now);
     const outM = (1 - part) * 1.1 * radiusM - part * this.strength * this.reach.depthM;
     return { positionM: [restM[0] + outM * n[0], restM[1] + outM * n[1], restM[2] + outM * n[2]], radiusM, shape: this.reach.tipShape };
   }

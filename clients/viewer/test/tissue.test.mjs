@@ -5,11 +5,11 @@ import { mkdtempSync, readFileSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { colourAt, cut, makeOrgan, pages, Server } from "./harness.mjs";
+import { colourAt, cut, makeOrgan, pageProcesses, pages, Server } from "./harness.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
-const { open, close } = pages({ width: 820, height: 540 });
+const { chromium, open, close } = pages({ width: 820, height: 540 });
 
 /** A scene on a mesh. @param {string} name */
 const onMesh = (name) => `name = "${name}"
@@ -112,6 +112,32 @@ describe("a body of any shape", () => {
       await page.until(({ forceN }) => forceN.length === 0);
     }
     assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("is touched on the same side of its lining after the browser stood still", async () => {
+    const others = await pageProcesses(chromium());
+    const page = await open(`${organs.url}/?scene=colon`);
+    const stopped = (await pageProcesses(chromium())).filter((id) => !others.includes(id));
+    await page.page.focus("#tissue");
+    for (let k = 0; k < 22; k++) await page.page.keyboard.press("+");
+    await page.page.waitForTimeout(300);
+    await page.page.check("input[value=tip]", { force: true });
+    await page.press();
+    await felt(page);
+    for (const stopMs of [200, 400, 800, 2500]) {
+      stopped.forEach((id) => process.kill(id, "SIGSTOP"));
+      try {
+        await new Promise((done) => setTimeout(done, stopMs));
+      } finally {
+        stopped.forEach((id) => process.kill(id, "SIGCONT"));
+      }
+      // What it shows first is from before.
+      await page.page.waitForTimeout(600);
+      await felt(page);
+    }
+    await page.page.mouse.up();
+    await page.until(({ forceN }) => forceN.length === 0);
     await close(page);
   });
 
