@@ -400,8 +400,13 @@ async fn a_live_session_tells_its_audited_error_and_why() {
 
 #[tokio::test]
 async fn a_live_solid_tells_the_error_of_its_cells_and_a_sheet_has_none() {
-    let server = TestServer::start(&["--audit-share", "0.5"]);
-    let phantom = server.create(Source::SceneName("phantom".into()), false).await.unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let coarse_phantom = "[solid]\norgan = { name = \"phantom\", edge_m = 0.008, seed = 1 }\ncell_m = 0.01\n\
+        fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
+        [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\n[stepping]\ntolerance = 1e-2\n";
+    std::fs::write(folder.path().join("coarse-phantom.toml"), coarse_phantom).unwrap();
+    let server = TestServer::start(&["--audit-share", "0.5", "--scenes", folder.path().to_str().unwrap()]);
+    let phantom = server.create(Source::SceneName("coarse-phantom".into()), false).await.unwrap();
     assert_eq!(phantom.mesh_error_estimate, None);
     let is_known = |status: &pb::Session| status.mesh_error_estimate.is_some();
     let top_m = phantom.extent.unwrap().top_m;
