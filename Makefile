@@ -344,8 +344,8 @@ bench-mesh: need-rust $(PEERS)/ready
 bench-organ: need-rust
 	$(CARGO) bench --quiet --bench organ -- $(ARGUMENTS)
 
-bench-solid: need-rust
-	$(CARGO) bench --quiet --bench solid -- $(ARGUMENTS)
+bench-solid: need-rust $(PEERS)/ready
+	PEERS=$(PEERS)/bin/python $(CARGO) bench --quiet --bench solid -- $(ARGUMENTS)
 
 bench-tick: need-rust
 	$(CARGO) bench --quiet --package palpate-client --bench tick

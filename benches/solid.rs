@@ -1,8 +1,9 @@
-//! Solids: the time of a step, and touch against solutions of other methods. Writes docs/benchmarks/solid.{md,svg}.
-//! `-- --quick` measures less.
+//! Solids: the time of a step, and touch against solutions of other methods. Writes docs/benchmarks/solid.{md,svg}. The peers
+//! run if PEERS names a Python that has them, as `make bench-solid` ensures. `-- --quick` measures less.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
+mod peers;
 mod report;
 
 use std::fmt::Write as _;
@@ -92,7 +93,9 @@ fn main() {
         "Release build, one thread. Times are the shortest of many runs, in which the rows of a table take turns.",
     );
     speed(&mut report);
+    compared(&mut report);
     let errors = touch(&mut report);
+    estimates(&mut report);
     deep(&mut report);
     lumps(&mut report);
     report.write(1, &[errors]);
@@ -142,6 +145,94 @@ fn speed(report: &mut BenchReport) {
     }
     let header = ["points", "substeps", "ns a point and substep", "µs a step", "% of a core at 1 kHz"];
     report.table(&header.map(str::to_owned), &rows);
+}
+
+/// A peer on the block, or the server.
+struct Compared {
+    name: String,
+    cell_mm: f64,
+    points: u64,
+    steps_per_ms: u64,
+    ms_us: f64,
+    stiffness_n_per_m: f64,
+}
+
+/// The same block and disc in other simulators.
+fn compared(report: &mut BenchReport) {
+    report.heading("Other simulators");
+    report.say(
+        "The block of the next section, ν = 0.45, with a force on the disc: the time of a millisecond at the fewest steps at which the \
+         block comes to rest, and the error of its stiffness. All on one thread of this machine. Each has the law of its own; these \
+         small strains ask for its moduli alone. Newton runs on the processor; it is written for graphics processors.",
+    );
+    let sizes_mm: &[f64] = if quick() { &[5.0] } else { &[5.0, 3.0] };
+    let mut restless = Vec::new();
+    let mut all: Vec<Compared> = sizes_mm.iter().map(|cell_mm| of_palpate(*cell_mm)).collect();
+    if let Some(python) = peers::python() {
+        let sizes: Vec<_> = sizes_mm.iter().map(ToString::to_string).collect();
+        for told in ["numba_solid.py", "mujoco_solid.py", "newton_solid.py"]
+            .map(|script| peers::lines(&python, script, &sizes))
+            .concat()
+        {
+            let (name, cell_mm) = (told["peer"].as_str().unwrap().to_owned(), told["cell_mm"].as_f64().unwrap());
+            if let Some(steps) = told["restless_at"].as_u64() {
+                restless.push(format!(
+                    "{name}, cubes of {cell_mm} mm: not at rest with {steps} steps a millisecond either."
+                ));
+                continue;
+            }
+            all.push(Compared {
+                name,
+                cell_mm,
+                points: told["points"].as_u64().unwrap(),
+                steps_per_ms: told["steps_per_ms"].as_u64().unwrap(),
+                ms_us: told["ms_us"].as_f64().unwrap(),
+                stiffness_n_per_m: told["stiffness_n_per_m"].as_f64().unwrap(),
+            });
+        }
+    }
+    all.sort_by(|a, b| b.cell_mm.total_cmp(&a.cell_mm));
+    let (_, truth) = STIFFNESS_N_PER_M[0];
+    let mut rows = Vec::new();
+    for Compared { name, cell_mm, points, steps_per_ms, ms_us, stiffness_n_per_m } in all {
+        let ns = 1e3 * ms_us / (points * steps_per_ms) as f64;
+        rows.push(cells([
+            name.clone(),
+            cell_mm.to_string(),
+            points.to_string(),
+            steps_per_ms.to_string(),
+            digits(ms_us),
+            digits(ns),
+            percent(stiffness_n_per_m / truth),
+        ]));
+        let figure = json!({ "ms_us": ms_us, "ns": ns, "error": stiffness_n_per_m / truth - 1.0 });
+        report.figure(&format!("{name}, {cell_mm} mm"), figure);
+    }
+    let header = ["", "cubes, mm", "points", "steps a ms", "µs a ms", "ns a point and step", "error of the stiffness"];
+    report.table(&header.map(str::to_owned), &rows);
+    restless.iter().for_each(|told| report.say(told));
+}
+
+fn of_palpate(cell_mm: f64) -> Compared {
+    let model = block(BLOCK_M, 1e-3 * cell_mm, 0.45, DQuat::IDENTITY, "");
+    let middle_m = DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z);
+    let mut tissue = at_rest(&model);
+    let force_n = DVec3::new(0.0, 0.0, -1e-3);
+    let poke = Poke { point: None, centre_m: middle_m, force_n, falloff_per_m: 200.0, falloff_offset: 0.0 };
+    tissue.push(0, Some(Push::Constant(poke)));
+    (0..50).for_each(|_| tissue.step().unwrap());
+    let times_s = least(if quick() { 5 } else { 100 }, &[std::cell::RefCell::new(tissue)], |tissue| {
+        let mut tissue = tissue.borrow_mut();
+        seconds(|| (0..5).for_each(|_| tissue.step().unwrap())).0 / 5.0
+    });
+    Compared {
+        name: "Palpate".to_owned(),
+        cell_mm,
+        points: model.len() as u64,
+        steps_per_ms: u64::from(model.plan.substeps),
+        ms_us: 1e6 * times_s[0],
+        stiffness_n_per_m: stiffness(&model, middle_m),
+    }
 }
 
 /// The error of stiffness by the size of cubes, at five places and turned.
@@ -200,6 +291,69 @@ fn touch(report: &mut BenchReport) -> Panel {
         up: 0.0..1.1 * most,
         series: vec![series("in line", 0, in_line), series("turned", 1, turned_errors)],
     }
+}
+
+/// Estimates of the error of the cells on random scenes.
+fn estimates(report: &mut BenchReport) {
+    report.heading("Estimates of random scenes");
+    report.say(
+        "Organs and turned blocks of random size and seed, with random cubes, ν and disc, pressed where a device presses first. The \
+         error is that against cubes half and a quarter as large, extrapolated to cubes of no size with the order 1.5; the estimate \
+         is what `palpate check` says, from cubes half as large.",
+    );
+    let mut rows = Vec::new();
+    for seed in 1..=if quick() { 2 } else { 10 } {
+        let dice = &mut fastrand::Rng::with_seed(seed);
+        let between = |dice: &mut fastrand::Rng, least: f64, most: f64| least + (most - least) * dice.f64();
+        let (cell_m, nu) = (between(dice, 0.004, 0.006), between(dice, 0.3, 0.49));
+        let radius_m = between(dice, 0.004, 0.008);
+        let folder = tempfile::tempdir().unwrap();
+        let (name, source) = match dice.u8(0..3) {
+            0 => ("kidney", format!("organ = {{ name = \"kidney\", edge_m = 0.003, seed = {seed} }}")),
+            1 => ("prostate", format!("organ = {{ name = \"prostate\", edge_m = 0.0025, seed = {seed} }}")),
+            _ => {
+                let size_m =
+                    DVec3::new(between(dice, 0.04, 0.06), between(dice, 0.04, 0.06), between(dice, 0.02, 0.03));
+                let turn = DQuat::from_rotation_z(dice.f64()) * DQuat::from_rotation_x(0.5 * dice.f64());
+                std::fs::write(folder.path().join("block.obj"), box_obj(size_m, |at| turn * (at - 0.5 * size_m)))
+                    .unwrap();
+                ("block", "file = \"block.obj\"\nunit = \"m\"".to_owned())
+            }
+        };
+        let model = |cell_m: f64| {
+            let text = format!(
+                "[solid]\n{source}\ncell_m = {cell_m:?}\nfixed = \"none\"\nfoundation_n_per_m3 = 2e5\n\
+                 [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = {nu:?}\ndamping_per_s = 100\n\
+                 [stepping]\nintegrator = \"central\"\nsubsteps = {}\n",
+                substeps(cell_m, nu)
+            );
+            let scene = Scene::parse_in(folder.path(), name, &text, &[], &Limits::default()).unwrap();
+            Model::compile(&scene, &Limits::default()).unwrap()
+        };
+        let own = model(cell_m);
+        let at_m = own.shape().pressed_m();
+        let of = |model: &Model| tangent::press(model, radius_m, at_m, 0.0, 1)[0].tangent.stiffness_n_per_m.z_axis.z;
+        let stiffness_n_per_m = of(&own);
+        let [half, quarter] = [0.5, 0.25].map(|part| of(&model(part * cell_m)));
+        let truth = quarter - (half - quarter) / (1.5_f64.exp2() - 1.0);
+        let (error, estimate) =
+            (stiffness_n_per_m / truth, MeshErrorEstimate::of(&own, Disc { radius_m, at_m }).unwrap().relative);
+        rows.push(cells([
+            seed.to_string(),
+            name.to_owned(),
+            digits(1e3 * cell_m),
+            digits(1e3 * radius_m),
+            format!("{nu:.2}"),
+            own.len().to_string(),
+            percent(error),
+            percent(1.0 + estimate),
+            digits(estimate / (error - 1.0)),
+        ]));
+        report.figure(&format!("estimate, seed {seed}"), json!({ "error": error - 1.0, "estimate": estimate }));
+    }
+    let header =
+        ["seed", "", "cubes, mm", "disc, mm", "ν", "points", "error of the stiffness", "estimate", "estimate ÷ error"];
+    report.table(&header.map(str::to_owned), &rows);
 }
 
 /// Presses slowly to some depths.

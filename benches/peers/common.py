@@ -96,3 +96,77 @@ def measure_meshes(peer, make):
     for path in sys.argv[1:]:
         mesh = Mesh(path)
         print(json.dumps({"peer": peer, "mesh": path, **windows(make(mesh), len(mesh.rest))}), flush=True)
+
+
+class Block:
+    """The block of benches/solid.rs, 60 × 60 × 30 mm in cubes of `cell_m`, held at its lowest face, from 0: its nodes x fastest,
+    the tetrahedra of each cube, and the weights of an even pressure on a disc in the middle of its top."""
+
+    YOUNGS_PA, POISSON, DENSITY, DAMPING_PER_S = 8e3, 0.45, 1060.0, 100.0
+    RADIUS_M, FORCE_N = 0.005, 0.02
+    SIZE_M = np.array([0.06, 0.06, 0.03])
+
+    def __init__(self, cell_m):
+        self.cell_m = cell_m
+        self.cells = np.rint(self.SIZE_M / cell_m).astype(int)
+        self.lame_pa = self.YOUNGS_PA * self.POISSON / ((1 + self.POISSON) * (1 - 2 * self.POISSON))
+        self.shear_pa = self.YOUNGS_PA / (2 * (1 + self.POISSON))
+        nx, ny, nz = self.cells + 1
+        z, y, x = np.mgrid[0:nz, 0:ny, 0:nx]
+        self.places_m = cell_m * np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        # Kuhn's six tetrahedra of each cube: the paths along its edges from one corner to the opposite one.
+        strides = [1, nx, nx * ny]
+        first = (np.arange(nx - 1)[None, None] + nx * np.arange(ny - 1)[None, :, None]
+                 + nx * ny * np.arange(nz - 1)[:, None, None]).ravel()
+        paths = [(0, 1, 2), (1, 2, 0), (2, 0, 1), (1, 0, 2), (0, 2, 1), (2, 1, 0)]
+        tets = []
+        for path, turned in zip(paths, [False] * 3 + [True] * 3):
+            corners = [first + sum(strides[axis] for axis in path[:count]) for count in range(4)]
+            if turned:
+                corners[1], corners[2] = corners[2], corners[1]
+            tets.append(np.stack(corners, axis=1))
+        self.tets = np.stack(tets, axis=1).reshape(-1, 4)
+
+    def weights(self, places_m):
+        """The part of the disc's force on each place; its mean depth has the same weights."""
+        low, high = places_m.min(axis=0), places_m.max(axis=0)
+        line = np.linspace(-self.RADIUS_M, self.RADIUS_M, 401)
+        x, y = np.meshgrid(line, line)
+        inside = x * x + y * y <= self.RADIUS_M**2
+        x, y = x[inside] + (low[0] + high[0]) / 2, y[inside] + (low[1] + high[1]) / 2
+        weights = np.zeros(len(places_m))
+        for at in np.flatnonzero(places_m[:, 2] > high[2] - 0.1 * self.cell_m):
+            hats = [1 - np.abs(along - c) / self.cell_m for along, c in ((x, places_m[at, 0]), (y, places_m[at, 1]))]
+            weights[at] = np.mean(np.clip(hats[0], 0, None) * np.clip(hats[1], 0, None))
+        return weights / weights.sum()
+
+    def held(self):
+        return self.places_m[:, 2] < 0.1 * self.cell_m
+
+
+def measure_blocks(peer, make, steps_per_ms):
+    """For each size of cubes in mm: `make(block, steps in a millisecond)` returns a function that does so many steps and one
+    that returns the mean depth under the disc, m. The first number of steps at which the block comes to rest counts;
+    "restless_at" is the last that was tried if there is none."""
+    for argument in sys.argv[1:]:
+        block = Block(1e-3 * float(argument))
+        for per_ms in steps_per_ms:
+            run, depth_m = make(block, per_ms)
+            run(200 * per_ms)
+            before_m = depth_m()
+            run(50 * per_ms)
+            rests = np.isfinite(depth_m()) and abs(depth_m() - before_m) < 0.01 * abs(before_m) and depth_m() > 0
+            if rests and depth_m() < 0.03:
+                break
+        else:
+            print(json.dumps({"peer": peer, "cell_mm": float(argument), "restless_at": steps_per_ms[-1]}), flush=True)
+            continue
+        stiffness = block.FORCE_N / depth_m()
+        times = []
+        end = time.perf_counter() + 2.0
+        while len(times) < 5 or time.perf_counter() < end:
+            begin = time.perf_counter()
+            run(per_ms)
+            times.append(time.perf_counter() - begin)
+        told = {"peer": peer, "cell_mm": float(argument), "points": len(block.places_m), "steps_per_ms": per_ms}
+        print(json.dumps({**told, "ms_us": 1e6 * min(times), "stiffness_n_per_m": stiffness}), flush=True)

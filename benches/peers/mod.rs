@@ -19,8 +19,10 @@ pub fn python() -> Option<PathBuf> {
 /// The lines that a peer's script prints as JSON; empty if it does not run.
 pub fn lines<A: AsRef<OsStr>>(python: &Path, script: &str, arguments: &[A]) -> Vec<Value> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers").join(script);
-    let mut command = Command::new(python);
-    command.arg(&script).args(arguments);
+    // Some write a log where they run.
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = Command::new(std::path::absolute(python).unwrap());
+    command.current_dir(folder.path()).arg(&script).args(arguments);
     command.env("OMP_NUM_THREADS", "1").env("NUMBA_NUM_THREADS", "1").env("PYTHONDONTWRITEBYTECODE", "1");
     let output = match command.output() {
         Ok(output) if output.status.success() => output.stdout,
