@@ -33,7 +33,7 @@
 //!   already; on one that is coarse, folded or thin it is not. Friction may only remove energy.
 //! - A tool that meets the tissue presses it as deep as both have approached in this substep. If it is deeper,
 //!   because its disc has moved to another part of the tissue in which the tool already is, the rest stays as
-//!   an offset. A new tool has no path yet: it presses as deep as it is placed. In that substep it does not
+//!   an offset; if both move apart, it stays free. A new tool has no path yet: it presses as deep as it is placed. In that substep it does not
 //!   test whether the tissue pulls on it: the impulses that move a surface at rest and stop it again cancel,
 //!   and rounding would decide.
 //! - A disc that lags behind its tool is pressed by no more than the tool's movement along the normal
@@ -388,10 +388,15 @@ impl Tool {
                 } else if depth_m <= 0.0 {
                     return ContactForce::default();
                 } else {
-                    self.contact_state = ContactState::Sticking;
                     let approach_m =
                         movement_m(model, layout, state, &self.footprint) - self.own_movement_m(model, plan);
-                    let within_m = if self.is_new { 0.0 } else { depth_m - approach_m.dot(self.normal).max(0.0) };
+                    let approach_m = approach_m.dot(self.normal);
+                    // What moves apart does not meet: rounding would decide whether it presses.
+                    if !self.is_new && approach_m <= 0.0 {
+                        return ContactForce::default();
+                    }
+                    self.contact_state = ContactState::Sticking;
+                    let within_m = if self.is_new { 0.0 } else { depth_m - approach_m };
                     self.offset_m = -within_m.max(0.0) * self.normal;
                 }
             }
