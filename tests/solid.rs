@@ -690,17 +690,24 @@ fn rigid_tips_meet_the_stiffness_that_theory_gives_wherever_the_cells_are() {
         for along in places.iter().copied() {
             let place_m = Some(DVec3::new(0.03, 0.03, 0.03) + cell_m * along);
             let base = Indentation { place_m, speed_m_per_s: 0.01, ..INDENTATION };
-            let (disc_n, depth_m) =
+            let (disc_n, disc_m) =
                 indented_n(&model, Indentation { shape: TipShape::RigidDisc, depth_m: 4e-4, ..base });
-            let disc = disc_n / depth_m / (32.0 / (3.0 * std::f64::consts::PI.powi(2)) * even_n_per_m);
+            let disc = disc_n / disc_m / (32.0 / (3.0 * std::f64::consts::PI.powi(2)) * even_n_per_m);
             let sphere = Indentation { shape: TipShape::Sphere, radius_m: 0.01, depth_m: 4e-3, ..base };
             let (sphere_n, depth_m) = indented_n(&model, sphere);
             let sphere = sphere_n / hertz_n(0.01, depth_m);
-            println!("{cell_m} {along}: {disc:.3} {sphere:.3}");
+            // What a device is told of the next depths.
+            let law = |shape: TipShape, radius_m: f64| {
+                force_law::of_tip(&model, force_law::exact(&model, radius_m), shape, radius_m)
+            };
+            let disc_law = law(TipShape::RigidDisc, 0.005).at_depth(disc_m).force_n / disc_n;
+            let sphere_law = law(TipShape::Sphere, 0.01).at_depth(depth_m).force_n / sphere_n;
+            println!("{cell_m} {along}: {disc:.3} {sphere:.3}, laws {disc_law:.3} {sphere_law:.3}");
             assert!(
                 (0.93..1.07).contains(&disc) && (0.85..1.15).contains(&sphere),
                 "{cell_m} {along}: {disc} {sphere}"
             );
+            assert!([disc_law, sphere_law].iter().all(|law| (0.9..1.1).contains(law)), "{disc_law} {sphere_law}");
         }
     }
 }

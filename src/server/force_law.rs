@@ -16,7 +16,7 @@ use tonic_types::StatusExt;
 use tracing::{Instrument, debug};
 
 use super::job_pool::{CancelFlag, JobPool, Urgency};
-use palpate_haptics::Law;
+use palpate_haptics::{Law, Tip, TipShape};
 use palpate_proto::{pb, touch};
 use palpate_realtime::SessionHandle;
 use palpate_realtime::law_cache::{SoughtLaw, have_same_laws};
@@ -24,7 +24,7 @@ use palpate_session::Sample;
 use palpate_session::budget::Account;
 use palpate_session::current_laws::{FIRST, Laws};
 use palpate_tissue::Model;
-use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::response::force_law::{self, Disc};
 
 /// After computing the laws of a place, the pause before those of the next place is this multiple of the time they
 /// took, but at most `LONGEST_PAUSE`.
@@ -108,13 +108,23 @@ struct Maker {
     job_pool: JobPool,
     account: Account,
     handle: Arc<SessionHandle>,
+    shape: TipShape,
 }
 
 impl Maker {
+    /// Returns the law of the stream's tip, from that of a disc.
+    fn of_tip(&self, law: Arc<Law>, model: &Model, disc: Disc) -> Arc<Law> {
+        if !self.shape.is_rigid() {
+            return law;
+        }
+        Arc::new(force_law::of_tip(model, Law::clone(&law), self.shape, disc.radius_m))
+    }
+
     /// Computes the first law of `disc`: at most 50 ms of work.
     async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
         let sought = self.handle.law(model, disc)?;
-        Ok(self.job_pool.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??)
+        let law = self.job_pool.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??;
+        Ok(self.of_tip(law, model, disc))
     }
 
     /// Computes the exact law of `disc`, depth by depth. Between two depths other work can run, also of this caller.
@@ -124,7 +134,7 @@ impl Maker {
         let mut computation = None;
         loop {
             if let Some(exact) = sought.exact() {
-                return Ok(exact?);
+                return Ok(self.of_tip(exact?, model, disc));
             }
             let sought: Arc<SoughtLaw> = sought.clone();
             let advance = move |stop: &CancelFlag| sought.advance(computation, stop.flag());
@@ -186,8 +196,7 @@ pub(super) struct Computing {
 }
 
 impl Computing {
-    /// Computes the first law for a stream of `handle` with a tip of `radius_m`. Returns it with the computation of
-    /// the later laws.
+    /// Computes the first law for a stream of `handle` with the tip `tip`. Returns it with the computation of the later laws.
     ///
     /// # Errors
     /// Returns an error if no law can be computed now: for lack of memory, work or time.
@@ -195,11 +204,11 @@ impl Computing {
         job_pool: &JobPool,
         account: &Account,
         handle: &Arc<SessionHandle>,
-        radius_m: f64,
+        Tip { shape, radius_m, .. }: Tip,
     ) -> Result<(Arc<Law>, Self), Status> {
         let mut tissue = handle.tissue();
         let model = tissue.borrow_and_update().1.clone();
-        let maker = Maker { job_pool: job_pool.clone(), account: account.clone(), handle: handle.clone() };
+        let maker = Maker { job_pool: job_pool.clone(), account: account.clone(), handle: handle.clone(), shape };
         let disc = Disc::in_middle(&model, radius_m);
         let law = maker.first(&model, disc).await?;
         let known = Known { number: FIRST, model, disc, is_coarse: law.is_coarse, has_places: true };
@@ -283,9 +292,13 @@ mod tests {
             self.handle.model.shape().edge_m()
         }
 
+        fn tip(&self) -> Tip {
+            Tip { radius_m: self.radius_m(), ..Tip::default() }
+        }
+
         /// The laws of a new stream.
         async fn begin(&self) -> (Arc<Law>, Arc<Laws>, Computing) {
-            let begun = Computing::begin(&self.job_pool, &self.account, &self.handle, self.radius_m()).await;
+            let begun = Computing::begin(&self.job_pool, &self.account, &self.handle, self.tip()).await;
             let (law, computing) = begun.unwrap();
             (law.clone(), Arc::new(Laws::new(law)), computing)
         }
@@ -375,10 +388,7 @@ mod tests {
         assert_eq!((exact.coarse_number, exact.tissue_step), (2, None));
         let exact = exact.law.unwrap();
         assert_eq!((exact.number, exact.coarse), (3, false));
-        assert_eq!(
-            touch::from_law(&exact).unwrap(),
-            palpate_tissue::response::force_law::exact(&model, course.radius_m())
-        );
+        assert_eq!(touch::from_law(&exact).unwrap(), force_law::exact(&model, course.radius_m()));
         assert_eq!(laws.newest().0, 3);
         // A stream that opens now starts with it.
         let law = course.begin().await.0;

@@ -5,6 +5,14 @@
 //! delay, a hand at 50 mm/s is 2.5 mm beyond the last sample. A polynomial through past samples extrapolates badly
 //! there. The tissue's own law, which the server computes from its model, is accurate.
 
+use std::f64::consts::PI;
+
+use crate::tip::TipShape;
+
+/// Stiffness of a flat rigid disc of radius a on a half-space, 2·a·E/(1 − ν²), divided by that of an even pressure, whose mean
+/// depth is 16·p·a·(1 − ν²)/(3π·E) (Johnson, Contact Mechanics, sections 3.4 and 3.6).
+const RIGID_TO_EVEN: f64 = 32.0 / (3.0 * PI * PI);
+
 /// Values of a force law at one depth: force, stiffness and damping. "Along" and "across" refer to the outward normal
 /// of the surface; a disc sticks or slides as [`crate::Touching`] decides.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -50,6 +58,60 @@ impl Law {
             drag_n_s_per_m: 0.0,
         };
         Law { step_m, rows: vec![row(0.0), row(stiffness_n_per_m * step_m)], is_coarse: false }
+    }
+
+    /// Returns the law of a tip of `radius_m` (m), if this is the law of a disc of that radius with an even pressure, on a linear
+    /// tissue whose modulus E/(1 − ν²) near the tip is `plane_modulus_pa`, Pa.
+    ///
+    /// On a half-space a flat rigid disc is [`RIGID_TO_EVEN`] as stiff (Boussinesq). A sphere of radius R that goes x into a
+    /// half-space touches what is within √(R·x), up to its half, and its stiffness is that of a rigid disc of this radius (Hertz):
+    /// g(x) = 2·E/(1 − ν²)·√(R·x). A tissue that is held nearby yields less by s·F, whatever the size of the tip, with s from the
+    /// law of the disc: so a sphere that is d deep has x = d + s·F(x), and the stiffness g/(1 − s·g). Stiffness and damping across
+    /// the normal, damping and drag change in the proportion of g.
+    pub fn of_tip(self, shape: TipShape, radius_m: f64, plane_modulus_pa: f64) -> Self {
+        let disc_n_per_m = RIGID_TO_EVEN * self.at_depth(0.0).stiffness_n_per_m;
+        let whole_n_per_m = 2.0 * plane_modulus_pa * radius_m;
+        if !shape.is_rigid() || disc_n_per_m <= 0.0 || whole_n_per_m <= 0.0 {
+            return self;
+        }
+        let spared_m_per_n = whole_n_per_m.recip() - disc_n_per_m.recip();
+        // Force and stiffness on a half-space.
+        let of_half_space = |into_m: f64| {
+            let touching = (into_m.min(radius_m) / radius_m).sqrt();
+            let force_n = 2.0 / 3.0 * touching * whole_n_per_m * into_m.min(radius_m);
+            (force_n + whole_n_per_m * (into_m - radius_m).max(0.0), touching)
+        };
+        let of_sphere = |depth_m: f64| {
+            let most_m = depth_m * (disc_n_per_m / whole_n_per_m).max(1.0);
+            let (mut low_m, mut high_m) = (0.0, most_m);
+            for _ in 0..60 {
+                let into_m = 0.5 * (low_m + high_m);
+                let is_deeper = into_m - spared_m_per_n * of_half_space(into_m).0 > depth_m;
+                if is_deeper { high_m = into_m } else { low_m = into_m }
+            }
+            let (force_n, touching) = of_half_space(0.5 * (low_m + high_m));
+            let stiffness_n_per_m = touching * whole_n_per_m;
+            (force_n, stiffness_n_per_m / (1.0 - spared_m_per_n * stiffness_n_per_m), touching)
+        };
+        let of_row = |(number, row): (usize, &Row)| {
+            let (force_n, stiffness_n_per_m, touching) = match shape {
+                TipShape::Sphere => of_sphere(number as f64 * self.step_m),
+                TipShape::RigidDisc | TipShape::Disc => {
+                    (RIGID_TO_EVEN * row.force_n, RIGID_TO_EVEN * row.stiffness_n_per_m, 1.0)
+                }
+            };
+            let part = RIGID_TO_EVEN * touching;
+            Row {
+                force_n,
+                stiffness_n_per_m,
+                across_n_per_m: part * row.across_n_per_m,
+                damping_n_s_per_m: part * row.damping_n_s_per_m,
+                across_n_s_per_m: part * row.across_n_s_per_m,
+                drag_n_s_per_m: part * row.drag_n_s_per_m,
+            }
+        };
+        let rows = self.rows.iter().enumerate().map(of_row).collect();
+        Law { rows, ..self }
     }
 
     /// Returns whether a client can use it: it has at least two rows and a positive step, all values are finite and
@@ -149,6 +211,41 @@ mod tests {
             }
         });
         Law { step_m: 5e-4, rows: rows.collect(), is_coarse: false }
+    }
+
+    #[test]
+    fn on_a_linear_tissue_rigid_tips_have_the_laws_of_boussinesq_and_hertz() {
+        let (radius_m, modulus_pa) = (0.004_f64, 9e3);
+        let whole_n_per_m: f64 = 2.0 * modulus_pa * radius_m;
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-12 + 1e-9 * b.abs();
+        // A half-space, a thin tissue on a firm table, and one that yields.
+        for spared_m_per_n in [0.0, 0.4 / whole_n_per_m, -0.3 / whole_n_per_m] {
+            let disc_n_per_m = (whole_n_per_m.recip() - spared_m_per_n).recip();
+            let even = Law::linear(disc_n_per_m * 3.0 * PI * PI / 32.0, 0.5);
+            let even =
+                Law { step_m: 1e-3, rows: (0..9).map(|row| even.at_depth(1e-3 * f64::from(row))).collect(), ..even };
+            assert_eq!(even.clone().of_tip(TipShape::Disc, radius_m, modulus_pa), even);
+            let disc = even.clone().of_tip(TipShape::RigidDisc, radius_m, modulus_pa);
+            let sphere = even.of_tip(TipShape::Sphere, radius_m, modulus_pa);
+            assert!(disc.is_sound() && sphere.is_sound());
+            assert_eq!((sphere.rows[0].force_n, sphere.rows[0].stiffness_n_per_m), (0.0, 0.0));
+            for (row, depth_m) in (1..9).map(|row| (row, 1e-3 * row as f64)) {
+                let (disc, sphere) = (disc.rows[row], sphere.rows[row]);
+                assert!(
+                    near(disc.force_n, disc_n_per_m * depth_m) && near(disc.stiffness_n_per_m, disc_n_per_m),
+                    "{disc:?}"
+                );
+                let into_m = depth_m + spared_m_per_n * sphere.force_n;
+                let (force_n, stiffness) = if into_m < radius_m {
+                    let touches_m = (radius_m * into_m).sqrt();
+                    (4.0 / 3.0 * modulus_pa * touches_m * into_m, 2.0 * modulus_pa * touches_m)
+                } else {
+                    (whole_n_per_m * (into_m - radius_m / 3.0), whole_n_per_m)
+                };
+                assert!(near(sphere.force_n, force_n), "{spared_m_per_n} {sphere:?} {force_n}");
+                assert!(near(sphere.stiffness_n_per_m, (stiffness.recip() - spared_m_per_n).recip()), "{sphere:?}");
+            }
+        }
     }
 
     #[test]

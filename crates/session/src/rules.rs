@@ -6,6 +6,7 @@ use super::command::Command;
 use palpate_haptics::{Tip, TipShape};
 use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
+use palpate_tissue::rigid_tip_work;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_reach};
 use palpate_tissue::scene::script::Action;
@@ -103,36 +104,42 @@ fn check_played_by_time(command: &Command) -> Result<()> {
     if is_played { Ok(()) } else { Err(Refusal::new(Reason::Missing, "pose.velocity_m_per_s", message)) }
 }
 
-/// Returns how many triangles a tip makes a session look up in a step of `substeps` substeps: its disc is laid out
-/// twice in each ([`RestShape::disc_work`]).
-fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
-    shape.disc_work(radius_m).saturating_mul(2 * u64::from(substeps))
+/// Returns how many triangles a tip makes a session look up in a step of `substeps` substeps: a disc of even pressure is laid out
+/// twice in each ([`RestShape::disc_work`]). For a rigid tip it is the number that takes as long ([`rigid_tip_work`]).
+fn contact_work(shape: &dyn RestShape, tip: LeasedTip, substeps: u32) -> u64 {
+    let of_substep = if tip.shape.is_rigid() {
+        rigid_tip_work(tip.radius_m, shape.edge_m())
+    } else {
+        shape.disc_work(tip.radius_m).saturating_mul(2)
+    };
+    of_substep.saturating_mul(u64::from(substeps))
 }
 
 /// Refuses a tip that would make a step too long for the other sessions of its thread. `tips` are the session's other tips.
 pub(super) fn check_contact_work(
     rules: &Rules,
     substeps: u32,
-    LeasedTip { radius_m: now_m, .. }: LeasedTip,
+    now: LeasedTip,
     tips: impl Iterator<Item = LeasedTip>,
 ) -> Result<()> {
     let shape = rules.scene.shape();
     let most = rules.limits.contact_work;
-    let others = tips.fold(0_u64, |sum, tip| sum.saturating_add(contact_work(shape, tip.radius_m, substeps)));
-    let all = others.saturating_add(contact_work(shape, now_m, substeps));
-    if all <= most {
+    let others = tips.fold(0_u64, |sum, tip| sum.saturating_add(contact_work(shape, tip, substeps)));
+    let all = |radius_m: f64| others.saturating_add(contact_work(shape, LeasedTip { radius_m, ..now }, substeps));
+    if all(now.radius_m) <= most {
         return Ok(());
     }
     // Halved until it fits: the work grows with the radius.
-    let fits = std::iter::successors(Some(0.5 * now_m), |radius_m| Some(0.5 * radius_m))
+    let fits = std::iter::successors(Some(0.5 * now.radius_m), |radius_m| Some(0.5 * radius_m))
         .take(16)
-        .find(|radius_m| others.saturating_add(contact_work(shape, *radius_m, substeps)) <= most);
+        .find(|radius_m| all(*radius_m) <= most);
     let advice =
         fits.map_or("release other tools first".to_owned(), |radius_m| format!("{} m fits", legible(radius_m)));
     let message = format!(
-        "is {} m: with it, a step would look up {all} triangles under the tips of this session, above {most} \
+        "is {} m: with it, a step would take as long as looking up {} triangles under the tips of this session, above {most} \
          (limits.contact_work); {advice}",
-        legible(now_m)
+        legible(now.radius_m),
+        all(now.radius_m)
     );
     Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
 }

@@ -37,3 +37,4 @@ pub use state::tissue_state::at_rest;
 pub use tools::applied_force::Push;
 pub use tools::contact::{TangentInput, ToolContact};
 pub use tools::prescribed::Grasp;
+pub use tools::rigid_tip::rigid_tip_work;

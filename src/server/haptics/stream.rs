@@ -123,7 +123,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
     let guard = handle.open_stream("Touch", kind, account)?;
     let begun = match device {
-        Some(_) => Some(Computing::begin(&services.job_pool, account, &handle, tip.radius_m).await?),
+        Some(_) => Some(Computing::begin(&services.job_pool, account, &handle, tip).await?),
         None => None,
     };
     let (law, computing) = begun.unzip();

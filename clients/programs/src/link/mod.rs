@@ -115,9 +115,10 @@ pub(crate) struct LinkArguments {
     /// a solid the top]
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["random", "boundary"])]
     place: Vec<f64>,
-    /// The tool's tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid
-    #[arg(long, value_name = "SHAPE", default_value = "disc", conflicts_with = "random")]
-    tip: TipShape,
+    /// The tool's tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid [default: sphere on a
+    /// solid, which is unstable under an even pressure that is deep; disc on other tissues]
+    #[arg(long, value_name = "SHAPE", conflicts_with = "random")]
+    tip: Option<TipShape>,
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
     radius_m: f64,
@@ -247,8 +248,9 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let scene = find_scene(&arguments.scene, Path::new("scenes"), &[], &limits).map_err(|refusal| {
         if refusal.place.is_none() { Refusal { field: "--scene".to_owned(), ..refusal } } else { refusal }
     })?;
-    let tip =
-        Tip { shape: arguments.tip, radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
+    let usual = if scene.shape().takes_rigid_tips() { TipShape::Sphere } else { TipShape::Disc };
+    let shape = arguments.tip.unwrap_or(usual);
+    let tip = Tip { shape, radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
     check_tip("--tip", scene.shape(), &tip)?;
     let model = Model::compile(&scene, &limits)?;
     let near_m = match (arguments.place.as_slice(), model.shape().dimensions()) {
@@ -265,7 +267,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let spot = Spot::new(&model, near_m, &tip);
     // A server first sends the law of the middle, and before the first press that of the place.
     let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
-    let laws = Arc::new(PlaceLaws::new(&model));
+    let laws = Arc::new(PlaceLaws::new(&model, tip.shape));
     let law = law_of(&laws, disc)?;
     let second = "from 0 to 1000";
     let second_m = 1e-3 * number("--second-tool-mm", arguments.second_tool_mm, second, |v| (0.0..=1e3).contains(&v))?;
@@ -276,7 +278,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
         let at_s = number("--tissue-change-s", at_s, &range, |v| (0.0..=LONGEST_S).contains(&v))?;
         let factor = arguments.tissue_change_factor;
         let factor = number("--tissue-change-factor", factor, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))?;
-        changed(&model, at_s, factor)
+        changed(&model, tip.shape, at_s, factor)
     });
     let change = change.transpose()?;
     let usual = if model.shape().is_uniform() { Rendering::Model } else { Rendering::Prediction };
@@ -310,7 +312,7 @@ fn law_of(laws: &PlaceLaws, disc: Disc) -> Result<Arc<Law>, Refusal> {
 }
 
 /// Returns a change of the tissue whose springs are stiffer by `factor` from `at_s` on.
-fn changed(model: &Model, at_s: f64, factor: f64) -> Result<TissueChange, Refusal> {
+fn changed(model: &Model, shape: TipShape, at_s: f64, factor: f64) -> Result<TissueChange, Refusal> {
     let scene = &model.scene;
     let change = Change {
         stiffness_n_per_m: Some(factor * scene.springs.stiffness_n_per_m),
@@ -318,5 +320,5 @@ fn changed(model: &Model, at_s: f64, factor: f64) -> Result<TissueChange, Refusa
         ..Change::default()
     };
     let model = model.changed(&change, scene, &Limits::default())?;
-    Ok(TissueChange { at_s, factor, laws: Arc::new(PlaceLaws::new(&model)), model })
+    Ok(TissueChange { at_s, factor, laws: Arc::new(PlaceLaws::new(&model, shape)), model })
 }

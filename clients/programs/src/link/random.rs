@@ -63,8 +63,9 @@ impl Choice {
         let limits = Limits::default();
         let model = Model::compile(&Scene::parse(name, text, &[], &limits)?, &limits)?;
         let disc = Disc::in_middle(&model, tip.radius_m);
-        let changes = FACTORS.iter().map(|factor| changed(&model, 0.0, *factor)).collect::<Result<_, _>>()?;
-        let laws = Arc::new(PlaceLaws::new(&model));
+        let changes =
+            FACTORS.iter().map(|factor| changed(&model, tip.shape, 0.0, *factor)).collect::<Result<_, _>>()?;
+        let laws = Arc::new(PlaceLaws::new(&model, tip.shape));
         Ok(Choice { law: law_of(&laws, disc)?, laws, disc, model, changes })
     }
 

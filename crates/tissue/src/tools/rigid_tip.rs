@@ -77,6 +77,17 @@ const FACING: f64 = 0.1;
 /// and the tip does not feel it.
 const FIXED_PART: f64 = 1e-3;
 
+/// Time of a sample that is touched, in a substep, divided by that of looking up one triangle of a disc of even pressure.
+const LOOKUPS_PER_SAMPLE: f64 = 100.0;
+
+/// Returns the time of a substep with a rigid tip of `radius_m` (m) on cells of `edge_m` (m), in triangles that a disc of even
+/// pressure would look up.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub fn rigid_tip_work(radius_m: f64, edge_m: f64) -> u64 {
+    let samples = std::f64::consts::PI * (AROUND * radius_m / spacing_m(radius_m, edge_m)).powi(2);
+    (LOOKUPS_PER_SAMPLE * samples) as u64
+}
+
 /// A part of the surface near a tip, and the points that it moves with.
 #[derive(Debug)]
 struct ContactSample {
@@ -89,6 +100,17 @@ struct ContactSample {
     weights: [f64; 8],
     /// Σ w²/mass over its movable points.
     relative_inverse_mass: f64,
+}
+
+impl ContactSample {
+    /// Returns the weighted sum of what its points have.
+    fn mean(&self, of: impl Fn(usize) -> DVec3) -> DVec3 {
+        let mut sum = DVec3::ZERO;
+        for k in 0..self.nodes.len() {
+            sum += self.weights[k] * of(self.nodes[k] as usize);
+        }
+        sum
+    }
 }
 
 /// A point that samples move with.
@@ -483,8 +505,7 @@ impl RigidTip {
         self.touched.clear();
         for (number, sample) in samples.iter().enumerate() {
             let force_n = self.forces_n[number];
-            let parts = || sample.nodes.iter().map(|node| *node as usize).zip(sample.weights);
-            let moved_m = parts().fold(DVec3::ZERO, |sum, (node, weight)| sum + weight * self.displacements_m[node]);
+            let moved_m = sample.mean(|node| self.displacements_m[node]);
             let from_m = sample.rest_m + moved_m - place_m;
             let (way, deep_m) = match shape {
                 TipShape::Sphere => (from_m.try_normalize().unwrap_or(-axis), radius_m - from_m.length()),
@@ -498,10 +519,10 @@ impl RigidTip {
             }
             let movement = |node: usize| {
                 let [i, j] = nodes[node].point;
-                let at = i * layout.stride + j;
-                DVec3::from_array([0, 1, 2].map(|c| state.d[c * layout.plane + at].wide()))
+                let component = |c: usize| state.d[c * layout.plane + i * layout.stride + j].wide();
+                DVec3::new(component(0), component(1), component(2))
             };
-            let moves = parts().fold(DVec3::ZERO, |sum, (node, weight)| sum + weight * movement(node));
+            let moves = sample.mean(movement);
             let slip_m = model.unit_m * moves - own_m;
             // The tangent of the law.
             let part = (deep_m / to_core_m).clamp(0.0, LARGEST_PART);
@@ -530,8 +551,7 @@ impl RigidTip {
             (held_n, sliding_n) = (0.0, 0.0);
             for at in touched.iter() {
                 let sample = &samples[at.sample];
-                let parts = || sample.nodes.iter().map(|node| *node as usize).zip(sample.weights);
-                let moved_n: DVec3 = parts().map(|(node, weight)| weight * change_n[node]).sum();
+                let moved_n = sample.mean(|node| change_n[node]);
                 let now_n = forces_n[at.sample];
                 let (pressed_n, stiffness) = (now_n.dot(at.way), at.stiffness_n_per_m);
                 let deep_m = at.deep_m - of_u * moved_n.dot(at.way);
@@ -555,8 +575,9 @@ impl RigidTip {
                 let force_n = pressing_n * at.way + across_n;
                 let by_n = force_n - now_n;
                 forces_n[at.sample] = force_n;
-                for (node, weight) in parts() {
-                    change_n[node] += weight * nodes[node].inverse_mass * by_n;
+                for k in 0..sample.nodes.len() {
+                    let node = sample.nodes[k] as usize;
+                    change_n[node] += sample.weights[k] * nodes[node].inverse_mass * by_n;
                 }
             }
         }

@@ -7,6 +7,20 @@ mod coarse;
 mod disc;
 mod exact;
 
+use palpate_haptics::{Law, TipShape};
+
+use crate::body::model::Model;
+use crate::scene::Body;
+
 pub use coarse::first;
 pub use disc::Disc;
 pub use exact::{Computation, LawProgress, exact, exact_within};
+
+/// Returns the law of a tip of `shape`, from that of a disc of `radius_m` (m) with an even pressure: the same law, if no rigid tip
+/// touches the tissue ([`Law::of_tip`]).
+pub fn of_tip(model: &Model, law: Law, shape: TipShape, radius_m: f64) -> Law {
+    let Body::Solid(solid) = &model.scene.body else { return law };
+    let nu = solid.material.poissons_ratio;
+    let youngs_modulus_pa = model.scene.springs.stiffness_n_per_m / model.unit_m;
+    law.of_tip(shape, radius_m, youngs_modulus_pa / (1.0 - nu * nu))
+}
