@@ -11,6 +11,8 @@ import type { ShownSession } from "./session";
 
 /** A playback is deleted after this time without a request, because a window that vanished can't delete it. */
 const IDLE_S = 120;
+/** How often a playback is deleted at most: the first try may wait too long for a connection. */
+const DISCARD_TRIES = 5;
 /** "What was that?" begins this long before now, and the player's buttons jump by this time. */
 export const BACK_S = 10;
 /**
@@ -57,9 +59,21 @@ export interface Shown extends JournalName {
   playback: string;
 }
 
-/** Deletes a playback, ignoring failures: the server also does so later. */
-export function discard({ sessionId }: Session): void {
-  void sessions.deleteSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS }).catch(() => {});
+/** Deletes a playback. If the server can't be reached for too long, it does so itself after `IDLE_S`. */
+export function discard(playback: Session): void {
+  void deleteSoon(playback);
+}
+
+async function deleteSoon({ sessionId }: Session): Promise<void> {
+  for (let tries = 0; tries < DISCARD_TRIES; tries++) {
+    try {
+      await sessions.deleteSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+      return;
+    } catch (error) {
+      if (!isPassing(error)) return;
+      await sleep(backoffMs(tries));
+    }
+  }
 }
 
 /** Creates a playback of a recording from a step on. */
