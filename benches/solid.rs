@@ -10,7 +10,7 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use palpate_haptics::Tip;
+use palpate_haptics::{Tip, TipShape};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
@@ -94,6 +94,7 @@ fn main() {
     );
     speed(&mut report);
     compared(&mut report);
+    theory(&mut report);
     let errors = touch(&mut report);
     estimates(&mut report);
     deep(&mut report);
@@ -233,6 +234,90 @@ fn of_palpate(cell_mm: f64) -> Compared {
         ms_us: 1e6 * times_s[0],
         stiffness_n_per_m: stiffness(&model, middle_m),
     }
+}
+
+/// A block of ν = 0 under a weak weight along z, held at the lowest place along `axis`, at rest.
+fn weighed(size_m: DVec3, cell_m: f64, axis: DVec3, gravity_m_per_s2: f64, damping_per_s: f64) -> Box<dyn Tissue> {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("block.obj"), box_obj(size_m, |at| at)).unwrap();
+    let text = format!(
+        "[solid]\nfile = \"block.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
+         fixed = [{{ plane_m = [0, 0, 0], normal = {:?}, within_m = 0.0 }}]\n\
+         [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = 0.0\ndamping_per_s = {damping_per_s:?}\n\
+         [gravity]\nacceleration_m_per_s2 = [0, 0, {:?}]\n\
+         [stepping]\nintegrator = \"central\"\nprecision = \"f64\"\nsubsteps = {}\n[sleep]\ntolerance = 0\n",
+        axis.to_array(),
+        -gravity_m_per_s2,
+        substeps(cell_m, 0.0) + 1
+    );
+    let scene = Scene::parse_in(folder.path(), "block", &text, &[], &Limits::default()).unwrap();
+    let mut tissue = at_rest(&Model::compile(&scene, &Limits::default()).unwrap());
+    (0..3000).for_each(|_| tissue.step().unwrap());
+    tissue
+}
+
+/// A flat rigid disc of radius a on a layer of thickness h that is bonded to a rigid base: κ = F·(1 − ν²)/(2·a·w·E) by a/h and ν
+/// (Hayes, Keer, Herrmann and Mockros, Journal of Biomechanics 5, 1972, p. 541, table 1).
+const LAYERS: [(f64, [(f64, f64); 2]); 3] =
+    [(0.2, [(0.3, 1.207), (0.45, 1.252)]), (0.4, [(0.3, 1.472), (0.45, 1.599)]), (0.6, [(0.3, 1.784), (0.45, 2.031)])];
+
+/// Cases whose solution is known.
+fn theory(report: &mut BenchReport) {
+    report.heading("Theory");
+    report.say(
+        "Blocks of 8 kPa. A column of 30 mm (ν = 0) that stands under its weight sinks by ρ·g·H²/(2·E) at its top. The end of a beam of \
+         60 × 12 × 12 mm (ν = 0) that is held at one end sinks by ρ·g·L⁴·12/(8·E·h²) + ρ·g·L²/(2·G·5/6) under its weight (Timoshenko). A \
+         flat rigid disc of radius a = 6 mm on layers of thickness h on a firm base, 10·a wide, pressed 0.3 mm deep: \
+         κ = F·(1 − ν²)/(2·a·w·E) of Hayes and others (Journal of Biomechanics 5, 1972, p. 541), whose layer is infinitely wide.",
+    );
+    let density_kg_per_m3 = 1060.0;
+    let mut rows = Vec::new();
+    let mut row = |report: &mut BenchReport, name: &str, cell_m: f64, found: f64, theory: f64, unit: &str| {
+        rows.push(cells([
+            name.to_owned(),
+            digits(1e3 * cell_m),
+            format!("{}{unit}", digits(found)),
+            format!("{}{unit}", digits(theory)),
+            percent(found / theory),
+        ]));
+        report.figure(&format!("{name}, {} mm", 1e3 * cell_m), json!({ "found": found, "theory": theory }));
+    };
+    let (column_m, beam_m) = (DVec3::new(0.03, 0.03, 0.03), DVec3::new(0.06, 0.012, 0.012));
+    for cell_m in [0.0075, 0.00375] {
+        let tissue = weighed(column_m, cell_m, DVec3::Z, 1.0, 60.0);
+        let top_m = DVec3::new(0.5 * column_m.x, 0.5 * column_m.y, column_m.z);
+        let sinks_um = -1e6 * tissue.surface_displacement_m(top_m).z;
+        let theory_um = 1e6 * density_kg_per_m3 * column_m.z.powi(2) / 16e3;
+        row(report, "column", cell_m, sinks_um, theory_um, " µm");
+    }
+    for cell_m in [0.006, 0.003, 0.0015] {
+        let tissue = weighed(beam_m, cell_m, DVec3::X, 0.01, 18.0);
+        let end_m = DVec3::new(beam_m.x, 0.5 * beam_m.y, beam_m.z);
+        let sinks_um = -1e6 * tissue.surface_displacement_m(end_m).z;
+        let load_n_per_m4 = density_kg_per_m3 * 0.01;
+        let bends_m = load_n_per_m4 * beam_m.x.powi(4) * 12.0 / (8.0 * 8e3 * beam_m.z.powi(2));
+        let shears_m = load_n_per_m4 * beam_m.x.powi(2) / (2.0 * 4e3 * 5.0 / 6.0);
+        row(report, "beam", cell_m, sinks_um, 1e6 * (bends_m + shears_m), " µm");
+    }
+    let radius_m = 0.006;
+    for (part, truths) in LAYERS {
+        for (nu, theory) in truths {
+            let size_m = DVec3::new(0.06, 0.06, radius_m / part);
+            let cell_m = 0.0025;
+            let mut tissue = at_rest(&block(size_m, cell_m, nu, DQuat::IDENTITY, ""));
+            let tip = Tip { shape: TipShape::RigidDisc, radius_m, friction: 0.0, ..Tip::default() };
+            for step in 0..300 {
+                let depth_m = (1e-5 * f64::from(step)).min(3e-4);
+                tissue.pose(0, DVec3::new(0.03, 0.03, size_m.z - depth_m), tip);
+                tissue.step().unwrap();
+            }
+            let force_n = tissue.tool_contact(0).unwrap().force_on_tool_n.z;
+            let kappa = force_n * (1.0 - nu * nu) / (2.0 * radius_m * 3e-4 * 8e3);
+            row(report, &format!("layer, a/h = {part}, ν = {nu}"), cell_m, kappa, theory, "");
+        }
+    }
+    let header = ["", "cubes, mm", "found", "theory", "error"];
+    report.table(&header.map(str::to_owned), &rows);
 }
 
 /// The error of stiffness by the size of cubes, at five places and turned.
