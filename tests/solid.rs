@@ -663,6 +663,26 @@ fn a_deep_indentation_tells_where_the_tissue_gives_way() {
     assert!((4e-3..6.1e-3).contains(&gives_way_at_m), "{:?}", deep.curve);
 }
 
+/// Deeper than the tissue bears an even pressure, it slips from the disc, which then comes out from beneath the surface.
+#[test]
+fn a_disc_that_the_tissue_slipped_from_comes_out_without_giving_energy() {
+    let text = scene::BUILT_IN.iter().find(|(name, _)| *name == "prostate").unwrap().1;
+    let scene = Scene::parse("prostate", text, &[], &Limits::default()).unwrap();
+    let mut tissue = at_rest(&Model::compile(&scene, &Limits::default()).unwrap());
+    let top_m = tissue.model().shape().pressed_m();
+    let mut has_slipped = false;
+    for step in 0..1400 {
+        let part = |from: u32, over: f64| (f64::from(step.max(from) - from) / over).min(1.0);
+        let depth_m = -3e-3 + 13e-3 * (part(0, 300.0) - part(800, 400.0));
+        let aside_m = 4e-3 * part(100, 200.0);
+        tissue.pose(0, top_m + DVec3::new(aside_m, -aside_m, -depth_m), Tip::default());
+        tissue.step().unwrap();
+        has_slipped |=
+            step > 800 && depth_m > 1e-3 && tissue.tool_contact(0).unwrap().contact_state == ContactState::Free;
+    }
+    assert_eq!((has_slipped, tissue.guard_events()), (true, 0));
+}
+
 /// Returns the mean of the forces on the way in and back at the last depth but `rows` of an indentation, N, and that depth, m.
 fn indented_n(model: &Arc<Model>, indentation: Indentation) -> (f64, f64) {
     let indented = indentation.run(model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap();

@@ -87,8 +87,8 @@ impl Faces {
         lists.map(|list| size_of_val(list.as_slice())).sum()
     }
 
-    /// Returns the group of the region of a cell, if it is a volume element. `groups` are those of the values so far; values
-    /// beyond the first [`MAX_REGIONS`] have none.
+    /// Returns the group of the region of a cell, if it is a volume element. `groups` are those of the values so far; one more than
+    /// [`MAX_REGIONS`] suffices for the draft to tell that some are left out.
     fn region(
         &self,
         kind: i64,
@@ -100,7 +100,7 @@ impl Faces {
         let Some((name, values)) = self.regions.as_ref().filter(|_| is_volume) else { return Ok(None) };
         let Some(value) = usize::try_from(number).ok().and_then(|number| values.get(number)) else { return Ok(None) };
         if !groups.contains_key(value) {
-            if groups.len() == MAX_REGIONS {
+            if groups.len() > MAX_REGIONS {
                 return Ok(None);
             }
             groups.insert(*value, draft.group(&format!("{name} {value}"))?);
@@ -134,9 +134,6 @@ impl Faces {
             corners.extend(list.map_err(|problem| fail(number, problem))?.iter().map(|at| at.saturating_add(first)));
             let region = self.region(*kind, number, &mut groups, draft).map_err(|problem| fail(number, problem))?;
             cell(*kind, &mut corners, region.as_slice(), draft).map_err(|problem| fail(number, problem))?;
-        }
-        if groups.len() == MAX_REGIONS {
-            draft.notes.push(format!("Regions beyond the first {MAX_REGIONS} are left out."));
         }
         if self.grid.ends.len() != self.types.len() {
             let message = format!("{} cells, but {} types", self.grid.ends.len(), self.types.len());
