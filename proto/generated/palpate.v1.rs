@@ -452,7 +452,7 @@ pub struct TouchOpen {
     /// The haptic device, one for all tools of the stream. With it samples have local models, and `opened` the force law.
     #[prost(message, optional, tag = "8")]
     pub device: ::core::option::Option<Device>,
-    /// The future tip of the stream's tools: the force law is computed for its radius. Absent: that of `Pose`.
+    /// The future tip of the stream's tools: the force law is that of its shape and radius. Absent: that of `Pose`.
     #[prost(message, optional, tag = "9")]
     pub tip: ::core::option::Option<Tip>,
     /// Local models contain K and B of the sheet around the tool also while it touches, not only while it grasps:

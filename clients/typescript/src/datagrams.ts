@@ -103,13 +103,13 @@ export class Datagrams {
   private heard({ carries, counts, networkMs, sample, rejection, isOver, lastPoseMs }: Heard): void {
     this.now = counts;
     this.networkMs = networkMs;
+    if (lastPoseMs && performance.timeOrigin + performance.now() - lastPoseMs > MAX_GAP_MS) this.onGap();
     if (isOver) return this.failed(counts.came > 0);
     if (sample) this.take(sample);
     if (rejection) this.onRejected(rejection.reason, rejection.message);
-    const changes = carries !== this.carries;
+    if (carries === this.carries) return;
     this.carries = carries;
-    if (lastPoseMs && performance.timeOrigin + performance.now() - lastPoseMs > MAX_GAP_MS) this.onGap();
-    if (changes) this.onChange();
+    this.onChange();
   }
 
   /** Accepts a sample, unless it is from a server that no longer owns the session. */

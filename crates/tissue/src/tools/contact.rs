@@ -33,9 +33,9 @@
 //!   already; on one that is coarse, folded or thin it is not. Friction may only remove energy.
 //! - A tool that meets the tissue presses it as deep as both have approached in this substep. If it is deeper,
 //!   because its disc has moved to another part of the tissue in which the tool already is, the rest stays as
-//!   an offset; if both move apart, it stays free. A new tool has no path yet: it presses as deep as it is placed. In that substep it does not
-//!   test whether the tissue pulls on it: the impulses that move a surface at rest and stop it again cancel,
-//!   and rounding would decide.
+//!   an offset; if both move apart, it stays free. A new tool has no path yet: it presses as deep as it is
+//!   placed. In that substep it does not test whether the tissue pulls on it: the impulses that move a surface
+//!   at rest and stop it again cancel, and rounding would decide.
 //! - A disc that lags behind its tool is pressed by no more than the tool's movement along the normal
 //!   ([`Tool::balance`]), and it moves by no more than half its radius at once.
 //! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool
