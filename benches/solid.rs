@@ -54,20 +54,34 @@ fn box_obj(size_m: DVec3, moved: impl Fn(DVec3) -> DVec3) -> String {
     text
 }
 
-/// A block in a lattice of cubes of `cell_m`, turned by `turn`, held at its lowest face.
-fn block(size_m: DVec3, cell_m: f64, nu: f64, turn: DQuat, more: &str) -> Arc<Model> {
+/// The keys of a scene whose shape is a file of its own.
+const OF_FILE: &str = "file = \"shape.obj\"\nunit = \"m\"";
+
+/// A solid of 8 kPa in a lattice of cubes of `cell_m`. `source` are the keys of its shape, and `obj` is the file of [`OF_FILE`];
+/// `fixed` tells what is held, `more` are further keys of the material and sections after it, and `stepping` further keys of that.
+fn solid([obj, source]: [&str; 2], cell_m: f64, nu: f64, fixed: &str, [more, stepping]: [&str; 2]) -> Arc<Model> {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("block.obj"), box_obj(size_m, |at| turn * at)).unwrap();
-    let normal = (turn * DVec3::Z).to_array();
+    std::fs::write(folder.path().join("shape.obj"), obj).unwrap();
     let text = format!(
-        "[solid]\nfile = \"block.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
-         fixed = [{{ plane_m = [0, 0, 0], normal = {normal:?}, within_m = 0.0 }}]\n\
-         [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = {nu:?}\ndamping_per_s = 100\n{more}\n\
-         [stepping]\nintegrator = \"central\"\nprecision = \"f32\"\nsubsteps = {}\n[sleep]\ntolerance = 0\n",
-        substeps(cell_m, nu)
+        "[solid]\n{source}\ncell_m = {cell_m:?}\n{fixed}\n\
+         [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = {nu:?}\n{more}\n\
+         [stepping]\nintegrator = \"central\"\n{stepping}\n[sleep]\ntolerance = 0\n",
     );
-    let scene = Scene::parse_in(folder.path(), "block", &text, &[], &Limits::default()).unwrap();
+    let scene = Scene::parse_in(folder.path(), "solid", &text, &[], &Limits::default()).unwrap();
     Model::compile(&scene, &Limits::default()).unwrap()
+}
+
+/// Holds a solid below the plane through 0 with this normal.
+fn held_below(normal: DVec3) -> String {
+    format!("fixed = [{{ plane_m = [0, 0, 0], normal = {:?}, within_m = 0.0 }}]", normal.to_array())
+}
+
+/// A block, turned by `turn`, held at its lowest face.
+fn block(size_m: DVec3, cell_m: f64, nu: f64, turn: DQuat, more: &str) -> Arc<Model> {
+    let obj = box_obj(size_m, |at| turn * at);
+    let stepping = format!("precision = \"f32\"\nsubsteps = {}", substeps(cell_m, nu));
+    let more = format!("damping_per_s = 100\n{more}");
+    solid([&obj, OF_FILE], cell_m, nu, &held_below(turn * DVec3::Z), [&more, &stepping])
 }
 
 /// Substeps of a millisecond at which dt·ω is 1.5 by the bound ω² = 4·(3λ + 2μ)/(ρ·a²).
@@ -78,9 +92,14 @@ fn substeps(cell_m: f64, nu: f64) -> u32 {
     (1e-3 * omega_per_s / 1.5).ceil() as u32
 }
 
-/// Stiffness under a small press of the disc, N/m.
-fn stiffness(model: &Model, at_m: DVec3) -> f64 {
-    tangent::press(model, RADIUS_M, at_m, 0.0, 1)[0].tangent.stiffness_n_per_m.z_axis.z
+/// Stiffness under a small press of a disc, N/m.
+fn stiffness(model: &Model, Disc { radius_m, at_m }: Disc) -> f64 {
+    tangent::press(model, radius_m, at_m, 0.0, 1)[0].tangent.stiffness_n_per_m.z_axis.z
+}
+
+/// The disc at a place.
+fn disc(at_m: DVec3) -> Disc {
+    Disc { radius_m: RADIUS_M, at_m }
 }
 
 fn percent(ratio: f64) -> String {
@@ -148,13 +167,14 @@ fn speed(report: &mut BenchReport) {
     report.table(&header.map(str::to_owned), &rows);
 }
 
-/// A peer on the block, or the server.
-struct Compared {
+/// What a simulator does with the block.
+struct SimulatorRun {
     name: String,
     cell_mm: f64,
     points: u64,
     steps_per_ms: u64,
-    ms_us: f64,
+    /// Time of a point and step, ns.
+    ns: f64,
     stiffness_n_per_m: f64,
 }
 
@@ -168,7 +188,7 @@ fn compared(report: &mut BenchReport) {
     );
     let sizes_mm: &[f64] = if quick() { &[5.0] } else { &[5.0, 3.0] };
     let mut restless = Vec::new();
-    let mut all: Vec<Compared> = sizes_mm.iter().map(|cell_mm| of_palpate(*cell_mm)).collect();
+    let mut all: Vec<SimulatorRun> = sizes_mm.iter().map(|cell_mm| of_palpate(*cell_mm)).collect();
     if let Some(python) = peers::python() {
         let sizes: Vec<_> = sizes_mm.iter().map(ToString::to_string).collect();
         for told in ["numba_solid.py", "mujoco_solid.py", "newton_solid.py"]
@@ -182,12 +202,12 @@ fn compared(report: &mut BenchReport) {
                 ));
                 continue;
             }
-            all.push(Compared {
+            all.push(SimulatorRun {
                 name,
                 cell_mm,
                 points: told["points"].as_u64().unwrap(),
                 steps_per_ms: told["steps_per_ms"].as_u64().unwrap(),
-                ms_us: told["ms_us"].as_f64().unwrap(),
+                ns: told["least_ns"].as_f64().unwrap(),
                 stiffness_n_per_m: told["stiffness_n_per_m"].as_f64().unwrap(),
             });
         }
@@ -195,8 +215,8 @@ fn compared(report: &mut BenchReport) {
     all.sort_by(|a, b| b.cell_mm.total_cmp(&a.cell_mm));
     let (_, truth) = STIFFNESS_N_PER_M[0];
     let mut rows = Vec::new();
-    for Compared { name, cell_mm, points, steps_per_ms, ms_us, stiffness_n_per_m } in all {
-        let ns = 1e3 * ms_us / (points * steps_per_ms) as f64;
+    for SimulatorRun { name, cell_mm, points, steps_per_ms, ns, stiffness_n_per_m } in all {
+        let ms_us = 1e-3 * ns * (points * steps_per_ms) as f64;
         rows.push(cells([
             name.clone(),
             cell_mm.to_string(),
@@ -214,7 +234,7 @@ fn compared(report: &mut BenchReport) {
     restless.iter().for_each(|told| report.say(told));
 }
 
-fn of_palpate(cell_mm: f64) -> Compared {
+fn of_palpate(cell_mm: f64) -> SimulatorRun {
     let model = block(BLOCK_M, 1e-3 * cell_mm, 0.45, DQuat::IDENTITY, "");
     let middle_m = DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z);
     let mut tissue = at_rest(&model);
@@ -226,32 +246,26 @@ fn of_palpate(cell_mm: f64) -> Compared {
         let mut tissue = tissue.borrow_mut();
         seconds(|| (0..5).for_each(|_| tissue.step().unwrap())).0 / 5.0
     });
-    Compared {
+    SimulatorRun {
         name: "Palpate".to_owned(),
         cell_mm,
         points: model.len() as u64,
         steps_per_ms: u64::from(model.plan.substeps),
-        ms_us: 1e6 * times_s[0],
-        stiffness_n_per_m: stiffness(&model, middle_m),
+        ns: 1e9 * times_s[0] / (model.len() as f64 * f64::from(model.plan.substeps)),
+        stiffness_n_per_m: stiffness(&model, disc(middle_m)),
     }
 }
 
 /// A block of ν = 0 under a weak weight along z, held at the lowest place along `axis`, at rest.
 fn weighed(size_m: DVec3, cell_m: f64, axis: DVec3, gravity_m_per_s2: f64, damping_per_s: f64) -> Box<dyn Tissue> {
-    let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("block.obj"), box_obj(size_m, |at| at)).unwrap();
-    let text = format!(
-        "[solid]\nfile = \"block.obj\"\nunit = \"m\"\ncell_m = {cell_m:?}\n\
-         fixed = [{{ plane_m = [0, 0, 0], normal = {:?}, within_m = 0.0 }}]\n\
-         [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = 0.0\ndamping_per_s = {damping_per_s:?}\n\
-         [gravity]\nacceleration_m_per_s2 = [0, 0, {:?}]\n\
-         [stepping]\nintegrator = \"central\"\nprecision = \"f64\"\nsubsteps = {}\n[sleep]\ntolerance = 0\n",
-        axis.to_array(),
-        -gravity_m_per_s2,
-        substeps(cell_m, 0.0) + 1
+    let more = format!(
+        "damping_per_s = {damping_per_s:?}\n[gravity]\nacceleration_m_per_s2 = [0, 0, {:?}]",
+        -gravity_m_per_s2
     );
-    let scene = Scene::parse_in(folder.path(), "block", &text, &[], &Limits::default()).unwrap();
-    let mut tissue = at_rest(&Model::compile(&scene, &Limits::default()).unwrap());
+    let stepping = format!("precision = \"f64\"\nsubsteps = {}", substeps(cell_m, 0.0) + 1);
+    let obj = box_obj(size_m, |at| at);
+    let model = solid([&obj, OF_FILE], cell_m, 0.0, &held_below(axis), [&more, &stepping]);
+    let mut tissue = at_rest(&model);
     (0..3000).for_each(|_| tissue.step().unwrap());
     tissue
 }
@@ -338,12 +352,12 @@ fn touch(report: &mut BenchReport) -> Panel {
         for cell_m in sizes_m.iter().copied() {
             let model = block(BLOCK_M, cell_m, nu, DQuat::IDENTITY, "");
             let ratios = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.25, 0.25], [0.25, 0.5]]
-                .map(|[x, y]| stiffness(&model, middle_m + cell_m * DVec3::new(x, y, 0.0)) / truth);
+                .map(|[x, y]| stiffness(&model, disc(middle_m + cell_m * DVec3::new(x, y, 0.0))) / truth);
             let least = ratios.iter().copied().fold(f64::INFINITY, f64::min);
             let largest = ratios.iter().copied().fold(0.0, f64::max);
             let turned = block(BLOCK_M, cell_m, nu, turn, "");
-            let turned_ratio = stiffness(&turned, turn * middle_m) / truth;
-            let estimate = MeshErrorEstimate::of(&model, Disc { radius_m: RADIUS_M, at_m: middle_m });
+            let turned_ratio = stiffness(&turned, disc(turn * middle_m)) / truth;
+            let estimate = MeshErrorEstimate::of(&model, disc(middle_m));
             let estimated = estimate.map_or(f64::NAN, |estimate| estimate.relative / (ratios[0] - 1.0));
             rows.push(cells([
                 nu.to_string(),
@@ -392,7 +406,7 @@ fn estimates(report: &mut BenchReport) {
         let between = |dice: &mut fastrand::Rng, least: f64, most: f64| least + (most - least) * dice.f64();
         let (cell_m, nu) = (between(dice, 0.004, 0.006), between(dice, 0.3, 0.49));
         let radius_m = between(dice, 0.004, 0.008);
-        let folder = tempfile::tempdir().unwrap();
+        let mut obj = String::new();
         let (name, source) = match dice.u8(0..3) {
             0 => ("kidney", format!("organ = {{ name = \"kidney\", edge_m = 0.003, seed = {seed} }}")),
             1 => ("prostate", format!("organ = {{ name = \"prostate\", edge_m = 0.0025, seed = {seed} }}")),
@@ -400,29 +414,21 @@ fn estimates(report: &mut BenchReport) {
                 let size_m =
                     DVec3::new(between(dice, 0.04, 0.06), between(dice, 0.04, 0.06), between(dice, 0.02, 0.03));
                 let turn = DQuat::from_rotation_z(dice.f64()) * DQuat::from_rotation_x(0.5 * dice.f64());
-                std::fs::write(folder.path().join("block.obj"), box_obj(size_m, |at| turn * (at - 0.5 * size_m)))
-                    .unwrap();
-                ("block", "file = \"block.obj\"\nunit = \"m\"".to_owned())
+                obj = box_obj(size_m, |at| turn * (at - 0.5 * size_m));
+                ("block", OF_FILE.to_owned())
             }
         };
         let model = |cell_m: f64| {
-            let text = format!(
-                "[solid]\n{source}\ncell_m = {cell_m:?}\nfixed = \"none\"\nfoundation_n_per_m3 = 2e5\n\
-                 [material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = {nu:?}\ndamping_per_s = 100\n\
-                 [stepping]\nintegrator = \"central\"\nsubsteps = {}\n",
-                substeps(cell_m, nu)
-            );
-            let scene = Scene::parse_in(folder.path(), name, &text, &[], &Limits::default()).unwrap();
-            Model::compile(&scene, &Limits::default()).unwrap()
+            let stepping = format!("substeps = {}", substeps(cell_m, nu));
+            let fixed = "fixed = \"none\"\nfoundation_n_per_m3 = 2e5";
+            solid([&obj, &source], cell_m, nu, fixed, ["damping_per_s = 100", &stepping])
         };
         let own = model(cell_m);
-        let at_m = own.shape().pressed_m();
-        let of = |model: &Model| tangent::press(model, radius_m, at_m, 0.0, 1)[0].tangent.stiffness_n_per_m.z_axis.z;
-        let stiffness_n_per_m = of(&own);
-        let [half, quarter] = [0.5, 0.25].map(|part| of(&model(part * cell_m)));
+        let disc = Disc { radius_m, at_m: own.shape().pressed_m() };
+        let [half, quarter] = [0.5, 0.25].map(|part| stiffness(&model(part * cell_m), disc));
         let truth = quarter - (half - quarter) / (1.5_f64.exp2() - 1.0);
-        let (error, estimate) =
-            (stiffness_n_per_m / truth, MeshErrorEstimate::of(&own, Disc { radius_m, at_m }).unwrap().relative);
+        let error = stiffness(&own, disc) / truth;
+        let estimate = MeshErrorEstimate::of(&own, disc).unwrap().relative;
         rows.push(cells([
             seed.to_string(),
             name.to_owned(),
@@ -484,11 +490,11 @@ fn lumps(report: &mut BenchReport) {
     let middle_m = DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z);
     let mut rows = Vec::new();
     for cell_m in sizes_m.iter().copied() {
-        let without = stiffness(&block(BLOCK_M, cell_m, 0.49, DQuat::IDENTITY, ""), middle_m);
+        let without = stiffness(&block(BLOCK_M, cell_m, 0.49, DQuat::IDENTITY, ""), disc(middle_m));
         let ratios = LUMPS.map(|(depth_m, _)| {
             let centre_m = (middle_m - depth_m * DVec3::Z).to_array();
             let lump = format!("[[inclusion]]\ncentre_m = {centre_m:?}\nradius_m = 0.005\nstiffness_factor = 5\n");
-            stiffness(&block(BLOCK_M, cell_m, 0.49, DQuat::IDENTITY, &lump), middle_m) / without
+            stiffness(&block(BLOCK_M, cell_m, 0.49, DQuat::IDENTITY, &lump), disc(middle_m)) / without
         });
         let told =
             ratios.iter().zip(LUMPS).map(|(ratio, (_, truth))| format!("{ratio:.3} ({})", percent(ratio / truth)));

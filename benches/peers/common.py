@@ -140,8 +140,15 @@ class Block:
             weights[at] = np.mean(np.clip(hats[0], 0, None) * np.clip(hats[1], 0, None))
         return weights / weights.sum()
 
-    def held(self):
-        return self.places_m[:, 2] < 0.1 * self.cell_m
+    def held(self, places_m):
+        """Whether each place is held."""
+        return places_m[:, 2] < 0.1 * self.cell_m
+
+    def push_n(self, weights):
+        """The force on each place, N, of which `weights` are the parts."""
+        push_n = np.zeros((len(weights), 3), np.float32)
+        push_n[:, 2] = -self.FORCE_N * weights
+        return push_n
 
 
 def measure_blocks(peer, make, steps_per_ms):
@@ -155,18 +162,12 @@ def measure_blocks(peer, make, steps_per_ms):
             run(200 * per_ms)
             before_m = depth_m()
             run(50 * per_ms)
-            rests = np.isfinite(depth_m()) and abs(depth_m() - before_m) < 0.01 * abs(before_m) and depth_m() > 0
-            if rests and depth_m() < 0.03:
+            now_m = depth_m()
+            if 0 < now_m < 0.03 and abs(now_m - before_m) < 0.01 * abs(before_m):
                 break
         else:
             print(json.dumps({"peer": peer, "cell_mm": float(argument), "restless_at": steps_per_ms[-1]}), flush=True)
             continue
-        stiffness = block.FORCE_N / depth_m()
-        times = []
-        end = time.perf_counter() + 2.0
-        while len(times) < 5 or time.perf_counter() < end:
-            begin = time.perf_counter()
-            run(per_ms)
-            times.append(time.perf_counter() - begin)
         told = {"peer": peer, "cell_mm": float(argument), "points": len(block.places_m), "steps_per_ms": per_ms}
-        print(json.dumps({**told, "ms_us": 1e6 * min(times), "stiffness_n_per_m": stiffness}), flush=True)
+        told["stiffness_n_per_m"] = block.FORCE_N / now_m
+        print(json.dumps({**told, **windows(run, len(block.places_m))}), flush=True)

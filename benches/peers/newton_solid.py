@@ -1,7 +1,5 @@
 """Newton (on Warp) on the processor, f32: tetrahedra by three of its solvers, which differ in what they solve."""
 
-import sys
-
 import numpy as np
 import warp
 
@@ -25,7 +23,7 @@ def maker(kind):
             cell_y=block.cell_m, cell_z=block.cell_m, density=block.DENSITY, k_mu=block.shear_pa, k_lambda=block.lame_pa,
             k_damp=0.0, add_surface_mesh_edges=False)
         places_m = np.array(builder.particle_q, float).reshape(-1, 3)
-        for held in np.flatnonzero(places_m[:, 2] < 0.1 * block.cell_m):
+        for held in np.flatnonzero(block.held(places_m)):
             builder.particle_mass[held] = 0.0
         if kind == "VBD":
             builder.color()
@@ -37,8 +35,7 @@ def maker(kind):
         }[kind]()
         states, control = [model.state(), model.state()], model.control()
         weights = block.weights(places_m)
-        push = np.zeros(places_m.shape, np.float32)
-        push[:, 2] = -block.FORCE_N * weights
+        push = block.push_n(weights)
         damping = np.float32(block.DAMPING_PER_S) * model.particle_mass.numpy()[:, None]
 
         def run(steps):
@@ -56,4 +53,3 @@ kinds = {"VBD": [1, 2, 4], "XPBD": [1, 2, 5, 10], "semi-implicit": [2, 4, 8, 16]
 for kind, steps_per_ms in kinds.items():
     iterations = f", {ITERATIONS[kind]} iterations" if kind in ITERATIONS else ""
     common.measure_blocks(f"Newton, {kind}{iterations}", maker(kind), steps_per_ms)
-    sys.stdout.flush()

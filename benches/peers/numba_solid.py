@@ -76,14 +76,12 @@ def make(block, per_ms):
     volumes = np.linalg.det(edges) / 6
     assert (volumes > 0).all()
     node_volumes = np.bincount(tets.ravel(), np.repeat(volumes / 4, 4))
-    mobility = np.where(block.held(), 0, dt_s**2 / (block.DENSITY * node_volumes))
+    mobility = np.where(block.held(places), 0, dt_s**2 / (block.DENSITY * node_volumes))
     weights = block.weights(places)
-    push = np.zeros(places.shape)
-    push[:, 2] = -block.FORCE_N * weights
     single = lambda values: np.ascontiguousarray(values, np.float32)
     u, d, f = (np.zeros(places.shape, np.float32) for _ in range(3))
     slopes = np.zeros((len(tets), 3, 3), np.float32)
-    data = (single(np.linalg.inv(edges)), single(volumes), single(node_volumes), single(mobility), single(push))
+    data = (single(np.linalg.inv(edges)), single(volumes), single(node_volumes), single(mobility), block.push_n(weights))
     laws = np.float32(block.shear_pa), np.float32(block.lame_pa), np.float32(1 - block.DAMPING_PER_S * dt_s)
     growth = np.zeros(len(places), np.float32)
     run = lambda steps: advance(steps, u, d, f, growth, slopes, tets.astype(np.uint32), *data, *laws)

@@ -135,10 +135,10 @@ class DatagramWorker {
   private tick(): void {
     const now = performance.now();
     const carries = this.health.carries(now);
-    const isLate = this.led && now - this.posedMs > MAX_STOP_MS;
-    if (carries !== this.carries || isLate) {
+    const isLate = now - this.posedMs > MAX_STOP_MS;
+    if (carries !== this.carries || (this.led && isLate)) {
       this.carries = carries;
-      this.tell(isLate ? { lastPoseMs: performance.timeOrigin + this.posedMs } : {});
+      this.tell({});
     }
     // Meanwhile the page sends the poses by calls, and starts anew here later.
     if (!carries || isLate || now - this.ledMs > PAGE_MS) this.rest();
@@ -224,7 +224,8 @@ class DatagramWorker {
   private tell(heard: Partial<Heard>): void {
     const { sent, came, fellBack } = this.health;
     const counts = { ...this.counted, sent: Number(sent), came: Number(came), fellBack };
-    const lastPoseMs = this.led && !this.carries ? performance.timeOrigin + this.posedMs : undefined;
+    const hasStopped = this.led && (!this.carries || performance.now() - this.posedMs > MAX_STOP_MS);
+    const lastPoseMs = hasStopped ? performance.timeOrigin + this.posedMs : undefined;
     page.postMessage({ carries: this.carries, counts, lastPoseMs, networkMs: this.networkMs, ...heard });
   }
 }

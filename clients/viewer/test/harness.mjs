@@ -228,6 +228,16 @@ export async function pageProcesses(browser) {
   return processInfo.filter(({ type }) => type === "renderer").map(({ id }) => id);
 }
 
+/** Does something while processes are stopped. @param {number[]} ids @param {() => Promise<unknown>} act */
+export async function whileStopped(ids, act) {
+  ids.forEach((id) => process.kill(id, "SIGSTOP"));
+  try {
+    await act();
+  } finally {
+    ids.forEach((id) => process.kill(id, "SIGCONT"));
+  }
+}
+
 /** A page, and all that its console was told. */
 export class Page {
   /**

@@ -5,7 +5,7 @@ import { mkdtempSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { pageProcesses, pages, paper, Server } from "./harness.mjs";
+import { pageProcesses, pages, paper, Server, whileStopped } from "./harness.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
@@ -101,12 +101,7 @@ describe("several pages on one session", () => {
     // All of it stands still, with its worker: its processes are stopped.
     const stopped = (await pageProcesses(chromium())).filter((id) => !others.includes(id));
     assert.notEqual(stopped.length, 0);
-    stopped.forEach((id) => process.kill(id, "SIGSTOP"));
-    try {
-      await pressAgain(well);
-    } finally {
-      stopped.forEach((id) => process.kill(id, "SIGCONT"));
-    }
+    await whileStopped(stopped, () => pressAgain(well));
     // It has the newest at once: credit kept what it missed on the server.
     await ill.until(({ largestM }) => largestM > 0.02);
     await close(ill);

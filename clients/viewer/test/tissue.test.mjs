@@ -5,7 +5,7 @@ import { mkdtempSync, readFileSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { colourAt, cut, makeOrgan, pageProcesses, pages, Server } from "./harness.mjs";
+import { colourAt, cut, makeOrgan, pageProcesses, pages, Server, whileStopped } from "./harness.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
@@ -126,12 +126,7 @@ describe("a body of any shape", () => {
     await page.press();
     await felt(page);
     for (const stopMs of [200, 400, 800, 2500]) {
-      stopped.forEach((id) => process.kill(id, "SIGSTOP"));
-      try {
-        await new Promise((done) => setTimeout(done, stopMs));
-      } finally {
-        stopped.forEach((id) => process.kill(id, "SIGCONT"));
-      }
+      await whileStopped(stopped, () => new Promise((done) => setTimeout(done, stopMs)));
       // What it shows first is from before.
       await page.page.waitForTimeout(600);
       await felt(page);

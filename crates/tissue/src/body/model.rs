@@ -288,6 +288,11 @@ impl Model {
         self.relative_mass_at(index) * (1.0 + self.extra_anchor_at(index))
     }
 
+    /// Returns Young's modulus of a solid without inclusions, Pa: that of the scene, or another one since.
+    pub(crate) fn youngs_modulus_pa(&self) -> f64 {
+        self.scene.springs.stiffness_n_per_m / self.unit_m
+    }
+
     /// Returns the stiffness that pulls the point at a place in memory back to where it rests, whatever its neighbours do: that of its anchor
     /// spring, or of a foundation, N/m.
     pub(crate) fn own_stiffness_n_per_m(&self, index: usize) -> f64 {

@@ -270,6 +270,18 @@ mod tests {
         }
     }
 
+    /// Returns an oscillator as tissues have it.
+    fn of_tissue(viscous_time_s: f64, branches: [MaxwellBranch; 3]) -> Oscillator {
+        Oscillator {
+            mass_kg: 1e-5,
+            damping_n_s_per_m: 2e-4,
+            anchor_stiffness_n_per_m: 0.0,
+            spring_stiffness_n_per_m: 300.0,
+            viscous_time_s,
+            branches,
+        }
+    }
+
     /// Asserts that an integrator is stable with the substeps of a millisecond that it gets.
     fn assert_gets_enough(integrator: Integrator, oscillator: &Oscillator) {
         let substeps = substeps(integrator, 1e-3, oscillator);
@@ -282,14 +294,7 @@ mod tests {
     #[test]
     fn every_scheme_gets_enough_substeps_for_any_viscosity() {
         for viscous_time_s in [1e-6, 1e-5, 1e-4, 1e-3, 1e-2] {
-            let oscillator = Oscillator {
-                mass_kg: 1e-5,
-                damping_n_s_per_m: 2e-4,
-                anchor_stiffness_n_per_m: 0.0,
-                spring_stiffness_n_per_m: 300.0,
-                viscous_time_s,
-                branches: Default::default(),
-            };
+            let oscillator = of_tissue(viscous_time_s, Default::default());
             for integrator in all().filter(|integrator| *integrator != Integrator::Rk4) {
                 assert_gets_enough(integrator, &oscillator);
             }
@@ -302,14 +307,7 @@ mod tests {
             for time_s in [1e-3, 0.03, 100.0] {
                 for viscous_time_s in [0.0, 3e-5] {
                     let branch = MaxwellBranch { stiffness, time_s };
-                    let oscillator = Oscillator {
-                        mass_kg: 1e-5,
-                        damping_n_s_per_m: 2e-4,
-                        anchor_stiffness_n_per_m: 0.0,
-                        spring_stiffness_n_per_m: 300.0,
-                        viscous_time_s,
-                        branches: [branch, MaxwellBranch::default(), branch],
-                    };
+                    let oscillator = of_tissue(viscous_time_s, [branch, MaxwellBranch::default(), branch]);
                     for integrator in [Integrator::Stormer, Integrator::Central, Integrator::Lagged] {
                         assert_gets_enough(integrator, &oscillator);
                     }

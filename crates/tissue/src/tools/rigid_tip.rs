@@ -389,16 +389,16 @@ impl RigidTip {
 
     /// Lets the tip cover what is under a disc. Returns the energy that the contact takes, J.
     fn cover(&mut self, model: &Model, footprint: &Footprint) -> f64 {
-        let covers = Some((footprint.anchor_m(), modulus_pa(model)));
+        let covers = Some((footprint.anchor_m(), model.youngs_modulus_pa()));
         if self.covers == covers {
             return 0.0;
         }
         // A tissue that has changed is no work of the tool.
-        let is_same = self.covers.is_none_or(|(_, before_pa)| before_pa == modulus_pa(model));
+        let is_same = self.covers.is_none_or(|(_, before_pa)| before_pa == model.youngs_modulus_pa());
         self.covers = covers;
         let mut gained_j = 0.0;
         let (anchor_m, rest_outward) = (footprint.anchor_m(), footprint.at_rest().1);
-        let modulus_pa = modulus_pa(model);
+        let modulus_pa = model.youngs_modulus_pa();
         for (number, sample) in self.samples.iter().enumerate() {
             let now = modulus_pa
                 * sample.relative_stiffness_m
@@ -590,11 +590,6 @@ fn relative_contact_per_m(model: &Model, cell: &CellPlace) -> f64 {
     let Body::Solid(solid) = &model.scene.body else { return 0.0 };
     let nu = solid.material.poissons_ratio;
     CONTACT_STIFFNESS * solid.factor(cell) / ((1.0 - nu * nu) * model.unit_m)
-}
-
-/// Returns Young's modulus of the tissue without inclusions, Pa: that of the scene, or another one since.
-fn modulus_pa(model: &Model) -> f64 {
-    model.scene.springs.stiffness_n_per_m / model.unit_m
 }
 
 /// Returns the distance b from the surface of a tip to its core, m; a disc has none.

@@ -21,6 +21,5 @@ pub use exact::{Computation, LawProgress, exact, exact_within};
 pub fn of_tip(model: &Model, law: Law, shape: TipShape, radius_m: f64) -> Law {
     let Body::Solid(solid) = &model.scene.body else { return law };
     let nu = solid.material.poissons_ratio;
-    let youngs_modulus_pa = model.scene.springs.stiffness_n_per_m / model.unit_m;
-    law.of_tip(shape, radius_m, youngs_modulus_pa / (1.0 - nu * nu))
+    law.of_tip(shape, radius_m, model.youngs_modulus_pa() / (1.0 - nu * nu))
 }
