@@ -76,6 +76,11 @@ fn held_below(normal: DVec3) -> String {
     format!("fixed = [{{ plane_m = [0, 0, 0], normal = {:?}, within_m = 0.0 }}]", normal.to_array())
 }
 
+/// How blocks are turned in the lattice.
+fn turned() -> DQuat {
+    DQuat::from_rotation_z(30_f64.to_radians()) * DQuat::from_rotation_x(20_f64.to_radians())
+}
+
 /// A block, turned by `turn`, held at its lowest face.
 fn block(size_m: DVec3, cell_m: f64, nu: f64, turn: DQuat, more: &str) -> Arc<Model> {
     let obj = box_obj(size_m, |at| turn * at);
@@ -115,6 +120,7 @@ fn main() {
     compared(&mut report);
     theory(&mut report);
     let errors = touch(&mut report);
+    curved(&mut report);
     estimates(&mut report);
     deep(&mut report);
     lumps(&mut report);
@@ -256,15 +262,15 @@ fn of_palpate(cell_mm: f64) -> SimulatorRun {
     }
 }
 
-/// A block of ν = 0 under a weak weight along z, held at the lowest place along `axis`, at rest.
-fn weighed(size_m: DVec3, cell_m: f64, axis: DVec3, gravity_m_per_s2: f64, damping_per_s: f64) -> Box<dyn Tissue> {
-    let more = format!(
-        "damping_per_s = {damping_per_s:?}\n[gravity]\nacceleration_m_per_s2 = [0, 0, {:?}]",
-        -gravity_m_per_s2
-    );
+/// A block of ν = 0, turned by `turn`, under a weak weight along its own z, held at its lowest place along its own `axis`, at rest.
+fn weighed(size_m: DVec3, cell_m: f64, turn: DQuat, axis: DVec3, weight: [f64; 2]) -> Box<dyn Tissue> {
+    let [gravity_m_per_s2, damping_per_s] = weight;
+    let pull_m_per_s2 = -gravity_m_per_s2 * (turn * DVec3::Z);
+    let more =
+        format!("damping_per_s = {damping_per_s:?}\n[gravity]\nacceleration_m_per_s2 = {:?}", pull_m_per_s2.to_array());
     let stepping = format!("precision = \"f64\"\nsubsteps = {}", substeps(cell_m, 0.0) + 1);
-    let obj = box_obj(size_m, |at| at);
-    let model = solid([&obj, OF_FILE], cell_m, 0.0, &held_below(axis), [&more, &stepping]);
+    let obj = box_obj(size_m, |at| turn * at);
+    let model = solid([&obj, OF_FILE], cell_m, 0.0, &held_below(turn * axis), [&more, &stepping]);
     let mut tissue = at_rest(&model);
     (0..3000).for_each(|_| tissue.step().unwrap());
     tissue
@@ -280,8 +286,8 @@ fn theory(report: &mut BenchReport) {
     report.heading("Theory");
     report.say(
         "Blocks of 8 kPa. A column of 30 mm (ν = 0) that stands under its weight sinks by ρ·g·H²/(2·E) at its top. The end of a beam of \
-         60 × 12 × 12 mm (ν = 0) that is held at one end sinks by ρ·g·L⁴·12/(8·E·h²) + ρ·g·L²/(2·G·5/6) under its weight (Timoshenko). A \
-         flat rigid disc of radius a = 6 mm on layers of thickness h on a firm base, 10·a wide, pressed 0.3 mm deep: \
+         60 × 12 × 12 mm (ν = 0) that is held at one end sinks by ρ·g·L⁴·12/(8·E·h²) + ρ·g·L²/(2·G·5/6) under its weight (Timoshenko); turned: \
+         by 20° about its axis, and as the block of the section on touch. A flat rigid disc of radius a = 6 mm on layers of thickness h on a firm base, 10·a wide, pressed 0.3 mm deep: \
          κ = F·(1 − ν²)/(2·a·w·E) of Hayes and others (Journal of Biomechanics 5, 1972, p. 541), whose layer is infinitely wide.",
     );
     let density_kg_per_m3 = 1060.0;
@@ -298,20 +304,23 @@ fn theory(report: &mut BenchReport) {
     };
     let (column_m, beam_m) = (DVec3::new(0.03, 0.03, 0.03), DVec3::new(0.06, 0.012, 0.012));
     for cell_m in [0.0075, 0.00375] {
-        let tissue = weighed(column_m, cell_m, DVec3::Z, 1.0, 60.0);
+        let tissue = weighed(column_m, cell_m, DQuat::IDENTITY, DVec3::Z, [1.0, 60.0]);
         let top_m = DVec3::new(0.5 * column_m.x, 0.5 * column_m.y, column_m.z);
         let sinks_um = -1e6 * tissue.surface_displacement_m(top_m).z;
         let theory_um = 1e6 * density_kg_per_m3 * column_m.z.powi(2) / 16e3;
         row(report, "column", cell_m, sinks_um, theory_um, " µm");
     }
-    for cell_m in [0.006, 0.003, 0.0015] {
-        let tissue = weighed(beam_m, cell_m, DVec3::X, 0.01, 18.0);
-        let end_m = DVec3::new(beam_m.x, 0.5 * beam_m.y, beam_m.z);
-        let sinks_um = -1e6 * tissue.surface_displacement_m(end_m).z;
+    let about_itself = DQuat::from_rotation_x(20_f64.to_radians());
+    let beams = [("beam", DQuat::IDENTITY), ("beam, turned about its axis", about_itself), ("beam, turned", turned())];
+    for (name, turn, cell_m) in beams.iter().flat_map(|(name, turn)| [0.006, 0.003, 0.0015].map(|m| (*name, *turn, m)))
+    {
+        let tissue = weighed(beam_m, cell_m, turn, DVec3::X, [0.01, 18.0]);
+        let end_m = turn * DVec3::new(beam_m.x, 0.5 * beam_m.y, beam_m.z);
+        let sinks_um = -1e6 * tissue.surface_displacement_m(end_m).dot(turn * DVec3::Z);
         let load_n_per_m4 = density_kg_per_m3 * 0.01;
         let bends_m = load_n_per_m4 * beam_m.x.powi(4) * 12.0 / (8.0 * 8e3 * beam_m.z.powi(2));
         let shears_m = load_n_per_m4 * beam_m.x.powi(2) / (2.0 * 4e3 * 5.0 / 6.0);
-        row(report, "beam", cell_m, sinks_um, 1e6 * (bends_m + shears_m), " µm");
+        row(report, name, cell_m, sinks_um, 1e6 * (bends_m + shears_m), " µm");
     }
     let radius_m = 0.006;
     for (part, truths) in LAYERS {
@@ -346,7 +355,7 @@ fn touch(report: &mut BenchReport) -> Panel {
     );
     let sizes_m: &[f64] = if quick() { &[0.005] } else { &[0.005, 0.00375, 0.003, 0.0025] };
     let middle_m = DVec3::new(0.5 * BLOCK_M.x, 0.5 * BLOCK_M.y, BLOCK_M.z);
-    let turn = DQuat::from_rotation_z(30_f64.to_radians()) * DQuat::from_rotation_x(20_f64.to_radians());
+    let turn = turned();
     let (mut rows, mut in_line, mut turned_errors) = (Vec::new(), Vec::new(), Vec::new());
     for (nu, truth) in STIFFNESS_N_PER_M {
         for cell_m in sizes_m.iter().copied() {
@@ -390,6 +399,80 @@ fn touch(report: &mut BenchReport) -> Panel {
         up: 0.0..1.1 * most,
         series: vec![series("in line", 0, in_line), series("turned", 1, turned_errors)],
     }
+}
+
+/// A sphere around 0 as an OBJ file, m.
+fn sphere_obj(radius_m: f64) -> String {
+    let (rings, spokes) = (60_u32, 120_u32);
+    let mut text = format!("v 0 0 {radius_m:?}\n");
+    for ring in 1..rings {
+        let down = std::f64::consts::PI * f64::from(ring) / f64::from(rings);
+        for spoke in 0..spokes {
+            let along = std::f64::consts::TAU * f64::from(spoke) / f64::from(spokes);
+            let at_m = radius_m * DVec3::new(down.sin() * along.cos(), down.sin() * along.sin(), down.cos());
+            let _ = writeln!(text, "v {:?} {:?} {:?}", at_m.x, at_m.y, at_m.z);
+        }
+    }
+    let last = 2 + (rings - 1) * spokes;
+    let _ = writeln!(text, "v 0 0 {:?}", -radius_m);
+    let vertex = |ring: u32, spoke: u32| match ring {
+        0 => 1,
+        _ if ring == rings => last,
+        _ => 2 + (ring - 1) * spokes + spoke % spokes,
+    };
+    for (ring, spoke) in (0..rings).flat_map(|ring| (0..spokes).map(move |spoke| (ring, spoke))) {
+        let [a, b, c, d] = [[0, 0], [1, 0], [1, 1], [0, 1]].map(|[down, on]| vertex(ring + down, spoke + on));
+        if ring > 0 {
+            let _ = writeln!(text, "f {a} {b} {d}");
+        }
+        if ring + 1 < rings {
+            let _ = writeln!(text, "f {d} {b} {c}");
+        }
+    }
+    text
+}
+
+/// The prostate of the scene with its nodules, and what holds it.
+const PROSTATE: [&str; 3] = [
+    "organ = { name = \"prostate\", edge_m = 0.0025, seed = 1 }",
+    "fixed = [{ group = \"front\" }]",
+    "[[inclusion]]\ncentre_m = [0.012, 0.004, 0.008]\nradius_m = 0.005\nstiffness_factor = 4.0\n\
+     [[inclusion]]\ncentre_m = [-0.011, -0.006, 0.006]\nradius_m = 0.0035\nstiffness_factor = 4.0",
+];
+
+/// Stiffness on it over a nodule and in the middle, N/m, with 17 kPa (docs/solids.md).
+const ON_PROSTATE: [(DVec3, f64); 2] =
+    [(DVec3::new(0.012, 0.004, 0.01585), 217.3), (DVec3::new(0.0, 0.0, 0.01289), 203.8)];
+
+/// Stiffness at the top of a sphere of 30 mm that is held 18 mm below its middle and lower, N/m (docs/solids.md).
+const ON_SPHERE: f64 = 91.44;
+
+/// Touch of curved solids.
+fn curved(report: &mut BenchReport) {
+    report.heading("Touch of curved solids");
+    report.say(
+        "The same disc at the top of a sphere of 30 mm radius that is held 18 mm below its middle and lower, and on the scene \
+         `prostate`, over a nodule and in its middle: the error against quadratic tetrahedra of another code that fit the body \
+         (docs/solids.md). ν = 0.45.",
+    );
+    let sizes_m: &[f64] = if quick() { &[0.005] } else { &[0.005, 0.00375, 0.003, 0.0025] };
+    let sphere = sphere_obj(0.03);
+    let mut rows = Vec::new();
+    for cell_m in sizes_m.iter().copied() {
+        let stepping = format!("substeps = {}", substeps(cell_m, 0.45));
+        let of = |source: [&str; 2], fixed: &str, more: &str| {
+            solid(source, cell_m, 0.45, fixed, [&format!("damping_per_s = 100\n{more}"), &stepping])
+        };
+        let held = "fixed = [{ plane_m = [0, 0, -0.018], normal = [0, 0, 1], within_m = 0.0 }]";
+        let on_sphere = stiffness(&of([&sphere, OF_FILE], held, ""), disc(0.03 * DVec3::Z)) / ON_SPHERE;
+        let [source, held, nodules] = PROSTATE;
+        let prostate = of(["", source], held, nodules);
+        let [nodule, middle] = ON_PROSTATE.map(|(at_m, truth)| stiffness(&prostate, disc(at_m)) / (truth * 8e3 / 17e3));
+        rows.push(cells([digits(1e3 * cell_m), percent(on_sphere), percent(nodule), percent(middle)]));
+        let figure = json!({ "sphere": on_sphere - 1.0, "nodule": nodule - 1.0, "middle": middle - 1.0 });
+        report.figure(&format!("curved, cell {cell_m}"), figure);
+    }
+    report.table(&["cubes, mm", "sphere", "prostate, over a nodule", "in its middle"].map(str::to_owned), &rows);
 }
 
 /// Estimates of the error of the cells on random scenes.

@@ -149,7 +149,7 @@ pub struct Solid {
     pub shape: Arc<SolidShape>,
     /// The material outside of inclusions.
     pub material: SolidMaterial,
-    /// The part of each cube that counts, times its factor of E ([`Lattice::index`]); 0 for a cube outside.
+    /// The part of each cube that counts for stiffness, times its factor of E ([`Lattice::index`]); 0 for a cube outside.
     weights: Arc<[f64]>,
     /// Mass of each point divided by the mass of a full cube.
     masses: Arc<[f64]>,
@@ -181,13 +181,13 @@ impl Solid {
     pub(crate) fn factor(&self, place: &CellPlace) -> f64 {
         let shape = &self.shape;
         let cell = shape.lattice().index(shape.corner_at(shape.corner_of(PointId::new(place.points[0] as usize))));
-        self.weights[cell] / shape.counted_part(cell).max(f64::MIN_POSITIVE)
+        self.weights[cell] / shape.stiffness_part(cell).max(f64::MIN_POSITIVE)
     }
 
     /// Creates a solid of a material without inclusions.
     pub fn new(shape: Arc<SolidShape>, material: SolidMaterial) -> Self {
-        let parts = shape.counted_parts();
-        let masses = shape.at_points(&parts).into();
+        let parts = shape.stiffness_parts();
+        let masses = shape.at_points(&shape.mass_parts()).into();
         Solid {
             layer_factors: vec![1.0; parts.len()].into(),
             weights: parts.into(),
@@ -267,7 +267,7 @@ impl Solid {
             let message = format!("are {}, more than {MAX_INCLUSIONS}", inclusions.len());
             return Err(Refusal::new(Reason::TooLarge, field, message));
         }
-        let mut weights = self.shape.counted_parts();
+        let mut weights = self.shape.stiffness_parts();
         let mut factors = self.layer_factors.to_vec();
         for (index, inclusion) in inclusions.iter().enumerate() {
             let field = format!("{field}[{index}]");
@@ -304,7 +304,7 @@ impl Solid {
         Ok(Solid { weights: weights.into(), largest_factor, slowest: SlowestVibration::default(), ..self.clone() })
     }
 
-    /// Returns the part of each cube that counts, times its factor of E, by [`Lattice::index`]; 0 for a cube outside.
+    /// Returns the part of each cube that counts for stiffness, times its factor of E, by [`Lattice::index`]; 0 for a cube outside.
     pub fn weights(&self) -> &[f64] {
         &self.weights
     }
@@ -320,8 +320,8 @@ impl Solid {
     }
 
     /// Returns the bound of the largest eigenvalue of the stiffness, divided by E·a. With the mass of a full cube m = ρ·a³
-    /// no vibration at rest is faster than ω² = 4·f·(3λ + 2μ)/(ρ·a²), for any part of each cube, because mass and
-    /// stiffness have the same weight; f is the largest factor of E. So m·ω²/(E·a) = 4·f·(3λ + 2μ)/E.
+    /// no vibration at rest is faster than ω² = 4·f·(3λ + 2μ)/(ρ·a²), for any part of each cube, because it counts for
+    /// stiffness at most as it does for mass; f is the largest factor of E. So m·ω²/(E·a) = 4·f·(3λ + 2μ)/E.
     fn bound(&self) -> f64 {
         4.0 * self.largest_factor * (3.0 * self.material.lame_over_youngs() + 2.0 * self.material.shear_over_youngs())
     }

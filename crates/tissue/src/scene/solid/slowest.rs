@@ -72,7 +72,7 @@ fn signs(corner: usize) -> [f64; 3] {
 impl MixedCells {
     #[allow(clippy::cast_precision_loss)]
     fn of(shape: &SolidShape, weights: &[f64], [shear, lame]: [f64; 2], beds: impl Fn(PointId) -> f64) -> Self {
-        let parts = shape.counted_parts();
+        let parts = shape.mass_parts();
         let inside = weights.iter().filter(|weight| **weight > 0.0).count();
         let mut by = 1;
         while inside > MIXED_CELLS * by * by * by {
