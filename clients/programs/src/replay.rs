@@ -420,7 +420,8 @@ async fn play(
                     return Err(ClientFailure::Failed(why.into()));
                 }
                 if wire::sample::add_to_record(&mut record, &message) {
-                    let record = std::mem::take(&mut record);
+                    let mut record = std::mem::take(&mut record);
+                    record.instruments = script.instrument_records(record.time_s, &record.tools);
                     measured.record(&record);
                     write_line(&mut output, &record).map_err(written)?;
                     records_left -= 1;

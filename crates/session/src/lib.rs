@@ -706,6 +706,7 @@ impl Session {
                 None => memory::collected(shape::points(shape).map(of), RECORD),
             },
             tools: Vec::new(),
+            instruments: Vec::new(),
             energy_j: None,
             awake_points: self.tissue.awake_points(),
         }

@@ -136,7 +136,8 @@ pub fn run_with(
                         on_fixed = session.tool_on_fixed().map(|tool| (tool, session.time_s()));
                     }
                     let (energy_j, tools) = (Some(session.energy()), session.tool_records());
-                    let record = Record { energy_j, tools, ..session.record(Some(&script.sample_points)) };
+                    let instruments = script.instrument_records(session.time_s(), &tools);
+                    let record = Record { energy_j, tools, instruments, ..session.record(Some(&script.sample_points)) };
                     largest_displacement_m = largest_displacement_m.max(session.tissue().largest_displacement_m());
                     peak_reaction_n = peak_reaction_n.max(record.peak_n(tip.is_some()));
                     if let Some((displacement_m, force_n)) = record.first(tip) {

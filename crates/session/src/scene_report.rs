@@ -246,13 +246,14 @@ fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
     script.forces.iter().map(force).collect()
 }
 
-/// Returns how each tool with a tip meets the tissue at rest, without the effects of other tools.
+/// Returns how each tool with a tip meets the tissue at rest, without the effects of other tools. Tips of instruments are left out:
+/// most of them stay away, and those that do not share the force.
 #[allow(clippy::cast_precision_loss)]
 fn tips(shape: &dyn RestShape, script: &Script, laws: &mut Laws<'_>) -> Vec<TipUse> {
     let first = script.tools() - script.poses.len();
     let end_s = script.steps as f64 / script.rate_hz;
     let of = |(tool, profile): (usize, &PoseProfile)| TipUse { tool, meeting: meeting(shape, profile, end_s, laws) };
-    (first..).zip(&script.poses).map(of).collect()
+    (first..).zip(&script.poses).filter(|(_, profile)| profile.mounted.is_none()).map(of).collect()
 }
 
 /// Returns how a tool meets the tissue at rest until `end_s`. The force is that of the law under a disc of its

@@ -86,7 +86,17 @@ impl Extent {
 
     /// Returns how far a place is beside the box along x and along y, m; 0 within it.
     pub fn beside_m(&self, place_m: DVec3) -> DVec2 {
-        (self.least_m - place_m).max(place_m - self.most_m).max(DVec3::ZERO).truncate()
+        self.beyond_m(place_m).truncate()
+    }
+
+    /// Returns the distance of a place from the box, m; 0 within it.
+    pub fn distance_m(&self, place_m: DVec3) -> f64 {
+        self.beyond_m(place_m).length()
+    }
+
+    /// Returns how far a place is beyond the box along each axis, m; 0 within it.
+    fn beyond_m(&self, place_m: DVec3) -> DVec3 {
+        (self.least_m - place_m).max(place_m - self.most_m).max(DVec3::ZERO)
     }
 
     /// Returns the ends of the part of a straight path whose x and y are within the box, or within `margin_m` of it, m;

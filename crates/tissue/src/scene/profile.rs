@@ -3,9 +3,10 @@
 //! Time is a number of whole steps and a fraction of the present step, so that a profile that jumps has a value
 //! on both sides: just before the jump at (n − 1, 1), just after it at (n, 0).
 
-use glam::DVec3;
+use std::sync::Arc;
 
-use palpate_haptics::Tip;
+use glam::DVec3;
+use palpate_haptics::{Instrument, InstrumentPose, Tip};
 
 use crate::shape::{self, PointId, RestShape};
 
@@ -219,21 +220,57 @@ pub struct PoseProfile {
     pub poses: Vec<(f64, DVec3)>,
     /// Time at which the tool is taken away, s, later than the first pose; infinite if it stays.
     pub until_s: f64,
+    /// The instrument that moves the tip, and the tip's number there; `poses` are then the places of the tip at the instrument's
+    /// poses.
+    pub mounted: Option<(Arc<InstrumentProfile>, usize)>,
 }
 
 impl PoseProfile {
     /// Returns the place of the tip at a time, m; `None` before the first pose and from `until_s` on. Between
-    /// two poses it is x₀ + (x₁ − x₀)·s(x), with the function s of a [`Move`].
+    /// two poses it is x₀ + (x₁ − x₀)·s(x), with the function s of a [`Move`]; on an instrument it is where that has it.
     pub fn at(&self, time_s: f64) -> Option<DVec3> {
-        let after = self.poses.partition_point(|pose| pose.0 <= time_s);
-        let (begun_s, from_m) = *self.poses.get(after.checked_sub(1)?)?;
-        if time_s >= self.until_s {
-            return None;
+        if let Some((instrument, tip)) = &self.mounted {
+            return Some(instrument.instrument.tip_m(*tip, &instrument.at(time_s)?));
         }
-        let Some((end_s, to_m)) = self.poses.get(after) else { return Some(from_m) };
-        let x = (time_s - begun_s) / (end_s - begun_s);
-        Some(from_m + (*to_m - from_m) * (x * x * x * (10.0 + x * (6.0 * x - 15.0))))
+        let (from_m, to) = reached(&self.poses, self.until_s, time_s)?;
+        Some(to.map_or(*from_m, |(to_m, part)| *from_m + (*to_m - *from_m) * part))
     }
+}
+
+/// The movement of an instrument, from pose to pose. It is away before the first pose and from `until_s` on. Each of its tips is a
+/// tool.
+#[derive(Debug, Clone, PartialEq)]
+pub struct InstrumentProfile {
+    /// The instrument.
+    pub instrument: Instrument,
+    /// Times, s, and poses, by strictly ascending time; at least one. Between two of them the instrument moves with the profile of a
+    /// [`Move`] ([`InstrumentPose::towards`]); after the last it stays.
+    pub poses: Vec<(f64, InstrumentPose)>,
+    /// Time at which it is taken away, s, later than the first pose; infinite if it stays.
+    pub until_s: f64,
+    /// The number of the tool that is its first tip; the others follow.
+    pub first_tool: usize,
+}
+
+impl InstrumentProfile {
+    /// Returns the pose at a time; `None` before the first pose and from `until_s` on.
+    pub fn at(&self, time_s: f64) -> Option<InstrumentPose> {
+        let (from, to) = reached(&self.poses, self.until_s, time_s)?;
+        Some(to.map_or(*from, |(to, part)| from.towards(to, part)))
+    }
+}
+
+/// Returns the last of some poses that has come at a time, s, and the next with the part of the way to it: s(x) of a [`Move`]. `None`
+/// before the first and from `until_s` on.
+fn reached<T>(poses: &[(f64, T)], until_s: f64, time_s: f64) -> Option<(&T, Option<(&T, f64)>)> {
+    let after = poses.partition_point(|pose| pose.0 <= time_s);
+    let (begun_s, from) = poses.get(after.checked_sub(1)?)?;
+    if time_s >= until_s {
+        return None;
+    }
+    let Some((end_s, to)) = poses.get(after) else { return Some((from, None)) };
+    let x = (time_s - begun_s) / (end_s - begun_s);
+    Some((from, Some((to, x * x * x * (10.0 + x * (6.0 * x - 15.0))))))
 }
 
 /// The position and motion of a prescribed point, as vectors in the tissue's frame. `default()` is at rest.

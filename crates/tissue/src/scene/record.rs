@@ -41,6 +41,9 @@ pub struct Record {
     /// The tools with a tip that are at the tissue, by ascending number; not written if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tools: Vec<ToolRecord>,
+    /// The script's instruments that are there, by ascending number; not written if there are none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub instruments: Vec<InstrumentRecord>,
     /// Energies of the whole tissue, J; `None` if they were not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_j: Option<EnergyJ>,
@@ -109,6 +112,28 @@ pub struct ToolRecord {
     pub displacement_m: [f64; 3],
     /// Force of the tissue on the tool, N, as a haptic device receives it. 0 while the tip does not touch.
     pub force_on_tool_n: [f64; 3],
+}
+
+/// The state of an instrument, whose tips are tools. Vectors are [x, y, z] in the tissue's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct InstrumentRecord {
+    /// The instrument's number in the script, from 0.
+    pub instrument: u32,
+    /// Place of its origin in the frame of the tissue at rest, m.
+    pub place_m: [f64; 3],
+    /// Turns vectors of the instrument's frame into the tissue's, as [w, x, y, z].
+    pub orientation: [f64; 4],
+    /// Force of the tissue on it, N: the sum over its tips.
+    pub force_on_tool_n: [f64; 3],
+    /// Torque of the tissue on it about `place_m`, N·m. The force of a tip acts at the tip's place.
+    pub torque_on_tool_n_m: [f64; 3],
+    /// The angle between its jaws, rad; `None`, and not written, without jaws.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub jaw_rad: Option<f64>,
+    /// Torque with which the tissue opens the jaws, N·m ([`Instrument::opening_n_m`](palpate_haptics::Instrument::opening_n_m));
+    /// `None`, and not written, without jaws.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub opening_n_m: Option<f64>,
 }
 
 /// Energies of the whole tissue, J, at the end of a step.

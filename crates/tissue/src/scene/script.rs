@@ -7,7 +7,8 @@ use glam::DVec3;
 
 use super::Change;
 pub use super::action::Action;
-use super::profile::{LoadProfile, Moment, MotionProfile, PoseProfile};
+use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile};
+use super::record::{InstrumentRecord, ToolRecord};
 use crate::shape::{PointId, RestShape};
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
@@ -21,6 +22,9 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("stroke", include_str!("../../../../scripts/stroke.toml")),
     ("vertical-60", include_str!("../../../../scripts/vertical-60.toml")),
 ];
+
+/// Distance from the tissue at rest from which on a tip of an instrument is not led, divided by the longest side of the tissue.
+const FAR_OF_SIDE: f64 = 0.25;
 
 /// A script bound to a scene: what tools do over time, and what is recorded. [`Script::load`] and
 /// [`Script::parse`] create it, with times as whole steps of the scene's rate. Tools are numbered from 0:
@@ -40,8 +44,10 @@ pub struct Script {
     pub forces: Vec<LoadProfile>,
     /// Grasped points, each by one tool only; tool numbers follow those of the forces.
     pub moves: Vec<MotionProfile>,
-    /// Tools with a tip; their numbers follow those of the grasped points.
+    /// Tools with a tip, at last the tips of the instruments; their numbers follow those of the grasped points.
     pub poses: Vec<PoseProfile>,
+    /// Instruments, in the order of the text. Their tips are tools of `poses`.
+    pub instruments: Vec<Arc<InstrumentProfile>>,
     /// Changes of the tissue, each with the step at whose beginning it takes effect, by strictly ascending
     /// step.
     pub changes: Vec<(u64, Change)>,
@@ -81,11 +87,19 @@ impl Script {
 
     /// Returns the poses that a client sends at step `step`, with their tool numbers, ascending: one for each
     /// tool with a tip at every step from its first pose to its end, because the server takes away a silent
-    /// tool; then one release. A tip reaches its place at the step's end.
+    /// tool; then one release. A tip reaches its place at the step's end. Tips of an instrument that are far from the tissue at
+    /// rest, by a quarter of its longest side, are not led: they would cost time and feel nothing.
     #[allow(clippy::cast_precision_loss)]
     pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let first = self.first_tip().unwrap_or_default();
-        let place_m = move |profile: &PoseProfile, end: u64| profile.at(end as f64 / self.rate_hz);
+        let far_m = FAR_OF_SIDE * self.shape.longest_side_m();
+        let extent = self.shape.extent();
+        let is_led = move |profile: &PoseProfile, place_m: &DVec3| {
+            profile.mounted.is_none() || extent.distance_m(*place_m) <= far_m + profile.tip.radius_m
+        };
+        let place_m = move |profile: &PoseProfile, end: u64| {
+            profile.at(end as f64 / self.rate_hz).filter(|place_m| is_led(profile, place_m))
+        };
         self.poses.iter().enumerate().filter_map(move |(index, profile)| {
             let action = match place_m(profile, step + 1) {
                 Some(place_m) => Action::Pose { place_m, velocity_m_per_s: None, tip: profile.tip },
@@ -98,6 +112,33 @@ impl Script {
     /// Returns the number of the first tool with a tip; `None` if the script has none.
     pub fn first_tip(&self) -> Option<usize> {
         (!self.poses.is_empty()).then_some(self.forces.len() + self.moves.len())
+    }
+
+    /// Returns the records of the instruments that are there at a time, s, from those of the tools.
+    pub fn instrument_records(&self, time_s: f64, tools: &[ToolRecord]) -> Vec<InstrumentRecord> {
+        let of = |(number, profile): (usize, &Arc<InstrumentProfile>)| {
+            let InstrumentProfile { instrument, first_tool, .. } = &**profile;
+            let pose = profile.at(time_s)?;
+            let tip_of = |tool: &ToolRecord| {
+                (tool.tool as usize).checked_sub(*first_tool).filter(|tip| *tip < instrument.tips.len())
+            };
+            let forces_n = || tools.iter().filter_map(|tool| Some((tip_of(tool)?, tool.force_on_tool_n.into())));
+            let wrench = instrument.wrench(&pose, forces_n());
+            let of_jaws = |value: f64| instrument.has_jaws().then_some(value + 0.0);
+            let array = |v: DVec3| (v + DVec3::ZERO).to_array();
+            let [x, y, z, w] = pose.orientation.to_array();
+            #[allow(clippy::cast_possible_truncation)]
+            Some(InstrumentRecord {
+                instrument: number as u32,
+                place_m: array(pose.place_m),
+                orientation: [w, x, y, z],
+                force_on_tool_n: array(wrench.force_n),
+                torque_on_tool_n_m: array(wrench.torque_n_m),
+                jaw_rad: of_jaws(pose.jaw_rad),
+                opening_n_m: of_jaws(instrument.opening_n_m(&pose, forces_n())),
+            })
+        };
+        self.instruments.iter().enumerate().filter_map(of).collect()
     }
 
     /// Returns the number of tools that the script uses: theirs are 0 to this − 1.

@@ -2,13 +2,16 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::Arc;
 
-use glam::{DVec2, DVec3};
-use palpate_haptics::{Coupling, Tip, TipShape};
+use glam::{DQuat, DVec2, DVec3};
+use palpate_haptics::instrument::{MAX_JAW_RAD, MAX_TIPS};
+use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Tip, TipShape};
 
 use super::kind::TextKind;
 use super::profile::{
-    CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile, weights,
+    CentreProfile, InstrumentProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile,
+    weights,
 };
 use super::script::Script;
 use super::{Change, Scene};
@@ -109,9 +112,19 @@ impl Binding<'_> {
                 ToolTable::Poses(profile) => poses.push(profile),
             }
         }
+        let mut instruments = Vec::new();
+        for item in items(fields, "instrument")? {
+            let first_tool = forces.len() + moves.len() + poses.len();
+            let profile = Arc::new(self.instrument(&item, first_tool)?);
+            poses.extend((0..profile.instrument.tips.len()).map(|tip| mounted(&profile, tip)));
+            instruments.push(profile);
+        }
         control_points.extend(moves.iter().map(|profile| profile.point));
-        let places = poses.iter().flat_map(|profile: &PoseProfile| &profile.poses);
-        control_points.extend(places.map(|(_, place_m)| self.scene.shape().nearest(*place_m)));
+        // A row of tips would make many.
+        let of_tools = poses.iter().filter(|profile: &&PoseProfile| profile.mounted.is_none());
+        let places_m = of_tools.flat_map(|profile| profile.poses.iter().map(|pose| pose.1));
+        let of_instruments = instruments.iter().flat_map(|profile| profile.poses.iter().map(|pose| pose.1.place_m));
+        control_points.extend(places_m.chain(of_instruments).map(|place_m| self.scene.shape().nearest(place_m)));
         for (index, profile) in moves.iter().enumerate() {
             if moves[..index].iter().any(|other| other.point == profile.point) {
                 let message = "is prescribed by two tools";
@@ -122,7 +135,8 @@ impl Binding<'_> {
         let tools = forces.len() + moves.len() + poses.len();
         if tools > self.limits.tools as usize {
             let message = format!(
-                "a script uses {tools} tools (one for each [[force]] and each [[tool]]), above the limit of {}",
+                "a script uses {tools} tools (one for each [[force]], each [[tool]] and each tip of an [[instrument]]), above the \
+                 limit of {}",
                 self.limits.tools
             );
             return Err(Refusal::new(Reason::TooLarge, "force", message));
@@ -142,6 +156,7 @@ impl Binding<'_> {
             forces,
             moves,
             poses,
+            instruments,
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
@@ -454,6 +469,93 @@ impl Binding<'_> {
         })
     }
 
+    /// Reads an instrument, whose first tip is tool `first_tool`.
+    fn instrument(&mut self, item: &Item<'_>, first_tool: usize) -> Result<InstrumentProfile> {
+        item.table(|fields| {
+            let instrument = self.tips(item, fields)?;
+            let list = fields.required("poses")?;
+            let mut poses: Vec<(f64, InstrumentPose)> = Vec::new();
+            for entry in list.list()? {
+                poses.push(entry.table(|fields| {
+                    let at_s = later(fields, poses.last().map(|pose| pose.0))?;
+                    let place_m = fields.required("place_m")?.vector()?;
+                    let orientation =
+                        fields.item("orientation").map_or(Ok(DQuat::IDENTITY), |item| item.quaternion())?;
+                    let jaw_rad = fields.number("jaw_rad")?.unwrap_or(0.0);
+                    if jaw_rad != 0.0 && !instrument.has_jaws() {
+                        return Err(fields.refuse(Reason::WrongKind, "jaw_rad", "is for an instrument with jaws"));
+                    }
+                    let range = format!("from 0 to {MAX_JAW_RAD:.4}");
+                    number(&fields.path("jaw_rad"), jaw_rad, &range, |v| (0.0..=MAX_JAW_RAD).contains(&v))?;
+                    let pose = InstrumentPose { place_m, orientation, jaw_rad };
+                    for tip in 0..instrument.tips.len() {
+                        let far_m = instrument.tip_m(tip, &pose).distance(self.scene.shape().extent().middle_m());
+                        check_reach(&fields.path("place_m"), self.scene.shape(), far_m, self.limits)?;
+                    }
+                    Ok((at_s, pose))
+                })?);
+            }
+            let until_s = until(fields, &list, poses.first().map(|pose| pose.0))?;
+            Ok(InstrumentProfile { instrument, poses, until_s, first_tool })
+        })
+    }
+
+    /// Reads the tips of an instrument: those that are listed, its shaft, and its jaws.
+    fn tips(&self, item: &Item<'_>, fields: &mut Fields<'_>) -> Result<Instrument> {
+        let shape = self.scene.shape();
+        // A rigid instrument meets a solid with spheres; other tissues know discs alone.
+        let usual =
+            Tip { shape: if shape.takes_rigid_tips() { TipShape::Sphere } else { TipShape::Disc }, ..Tip::default() };
+        let read = |fields: &mut Fields<'_>| {
+            let tip = tip_of(fields, usual)?;
+            if tip.grasps || tip.coupling != Coupling::Constraint {
+                let key = if tip.grasps { "grasps" } else { "spring" };
+                return Err(fields.refuse(Reason::WrongKind, key, "is for a [[tool]]: tips of an instrument touch"));
+            }
+            check_tip(fields.own_path(), shape, &tip).map(|()| tip)
+        };
+        let mut instrument = Instrument::default();
+        for tip in fields.item("tips").map_or(Ok(Vec::new()), |tips| tips.list())? {
+            instrument.tips.push(tip.table(|fields| {
+                let offset_m = fields.item("offset_m").map_or(Ok(DVec3::ZERO), |item| item.vector())?;
+                Ok(InstrumentTip { offset_m, tip: read(fields)?, part: InstrumentPart::Body })
+            })?);
+        }
+        let mut from_m = DVec3::ZERO;
+        if let Some(jaws) = fields.item("jaws") {
+            let (length_m, tip) = jaws.table(|fields| {
+                let length_m = positive(&fields.path("length_m"), fields.required_number("length_m")?)?;
+                Ok((length_m, read(fields)?))
+            })?;
+            instrument.hinge_m = -length_m * DVec3::X;
+            from_m = instrument.hinge_m;
+            // Closed jaws touch each other.
+            let begin_m = from_m + (2.0 * tip.radius_m).min(length_m) * DVec3::X;
+            for (part, side) in [(InstrumentPart::UpperJaw, 1.0), (InstrumentPart::LowerJaw, -1.0)] {
+                let beside_m = if tip.shape == TipShape::Sphere { side * tip.radius_m * DVec3::Y } else { DVec3::ZERO };
+                instrument.add_row(begin_m + beside_m, beside_m, tip, part);
+            }
+        }
+        if let Some(shaft) = fields.item("shaft") {
+            let (length_m, tip) = shaft.table(|fields| {
+                let length_m = positive(&fields.path("length_m"), fields.required_number("length_m")?)?;
+                Ok((length_m, read(fields)?))
+            })?;
+            instrument.add_row(from_m, from_m - length_m * DVec3::X, tip, InstrumentPart::Body);
+        }
+        if instrument.tips.is_empty() {
+            return Err(item.refuse(Reason::Missing, "must have `tips`, a `shaft` or `jaws`"));
+        }
+        if instrument.tips.len() > MAX_TIPS {
+            let message = format!(
+                "has {} tips, above the limit of {MAX_TIPS}: rows have one for each radius of their length",
+                instrument.tips.len()
+            );
+            return Err(item.refuse(Reason::TooLarge, message));
+        }
+        Ok(instrument)
+    }
+
     /// Reads a tool with a tip.
     fn poses(&mut self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
         let shape = self.scene.shape();
@@ -462,14 +564,7 @@ impl Binding<'_> {
         let mut poses: Vec<(f64, DVec3)> = Vec::new();
         for entry in list.list()? {
             poses.push(entry.table(|fields| {
-                let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
-                if poses.last().is_some_and(|last| at_s < last.0 + SHORTEST_MOVE_S) {
-                    return Err(fields.refuse(
-                        Reason::OutOfRange,
-                        "at_s",
-                        "must be later than that of the pose before",
-                    ));
-                }
+                let at_s = later(fields, poses.last().map(|pose| pose.0))?;
                 let place_m = fields.required("place_m")?.vector()?;
                 let far_m = place_m.distance(shape.extent().middle_m());
                 let field = fields.path("place_m");
@@ -490,14 +585,8 @@ impl Binding<'_> {
                 Ok((at_s, place_m))
             })?);
         }
-        let Some((begin_s, _)) = poses.first().copied() else {
-            return Err(list.refuse(Reason::Missing, "must have at least one pose"));
-        };
-        let until_s = fields.number("until_s")?.unwrap_or(f64::INFINITY);
-        if until_s <= begin_s {
-            return Err(fields.refuse(Reason::OutOfRange, "until_s", "must be later than the first pose"));
-        }
-        Ok(PoseProfile { tip, poses, until_s })
+        let until_s = until(fields, list, poses.first().map(|pose| pose.0))?;
+        Ok(PoseProfile { tip, poses, until_s, mounted: None })
     }
 }
 
@@ -517,8 +606,42 @@ struct ForceSpread {
     falloff_offset: f64,
 }
 
+/// Returns the tool that is a tip of an instrument.
+fn mounted(profile: &Arc<InstrumentProfile>, number: usize) -> PoseProfile {
+    let InstrumentProfile { instrument, poses, until_s, .. } = &**profile;
+    PoseProfile {
+        tip: instrument.tips[number].tip,
+        poses: poses.iter().map(|(at_s, pose)| (*at_s, instrument.tip_m(number, pose))).collect(),
+        until_s: *until_s,
+        mounted: Some((profile.clone(), number)),
+    }
+}
+
+/// Reads the time of a pose, which must be later than that of the pose before, s.
+fn later(fields: &mut Fields<'_>, before_s: Option<f64>) -> Result<f64> {
+    let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
+    if before_s.is_some_and(|before_s| at_s < before_s + SHORTEST_MOVE_S) {
+        return Err(fields.refuse(Reason::OutOfRange, "at_s", "must be later than that of the pose before"));
+    }
+    Ok(at_s)
+}
+
+/// Reads the time at which a tool is taken away, s; `list` are its poses, which begin at `begin_s`.
+fn until(fields: &mut Fields<'_>, list: &Item<'_>, begin_s: Option<f64>) -> Result<f64> {
+    let Some(begin_s) = begin_s else { return Err(list.refuse(Reason::Missing, "must have at least one pose")) };
+    let until_s = fields.number("until_s")?.unwrap_or(f64::INFINITY);
+    if until_s <= begin_s {
+        return Err(fields.refuse(Reason::OutOfRange, "until_s", "must be later than the first pose"));
+    }
+    Ok(until_s)
+}
+
 fn read_tip(fields: &mut Fields<'_>) -> Result<Tip> {
-    let standard = Tip::default();
+    tip_of(fields, Tip::default())
+}
+
+/// Reads a tip; what is absent is that of `standard`.
+fn tip_of(fields: &mut Fields<'_>, standard: Tip) -> Result<Tip> {
     let coupling = match fields.item("spring") {
         None => standard.coupling,
         Some(item) => item.table(|fields| {

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DVec2, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 use toml::de::{DeTable, DeValue};
 
 use crate::shape::PointName;
@@ -213,6 +213,11 @@ pub struct Item<'a> {
 }
 
 impl<'a> Fields<'a> {
+    /// Returns the full path of this table; empty for the document.
+    pub fn own_path(&self) -> &str {
+        &self.path
+    }
+
     /// Returns the full path of `key` in this table, for example `stepping.rate_hz`. The key need not exist.
     pub fn path(&self, key: &str) -> String {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
@@ -449,6 +454,20 @@ impl<'a> Item<'a> {
     /// finite.
     pub fn vector(&self) -> Result<DVec3> {
         Ok(DVec3::from_array(self.numbers("a list of three numbers")?))
+    }
+
+    /// Returns the value, `[w, x, y, z]`, as a rotation.
+    ///
+    /// # Errors
+    /// Refuses a value that is not a list of four numbers ([`Reason::WrongKind`]), a number that is not finite, and one whose length
+    /// is not 1 within a thousandth ([`Reason::OutOfRange`]).
+    pub fn quaternion(&self) -> Result<DQuat> {
+        let [w, x, y, z] = self.numbers("a list of four numbers, w, x, y and z")?;
+        let turn = DQuat::from_xyzw(x, y, z, w);
+        if (turn.length() - 1.0).abs() <= 1e-3 {
+            return Ok(turn.normalize());
+        }
+        Err(self.refuse(Reason::OutOfRange, format!("must have the length 1, but has {}", turn.length())))
     }
 
     /// Returns the value as `[x, y]`, in the unit that its key names.
