@@ -69,7 +69,7 @@ impl InstrumentPose {
     pub fn towards(&self, other: &Self, part: f64) -> Self {
         InstrumentPose {
             place_m: self.place_m + (other.place_m - self.place_m) * part,
-            orientation: self.orientation.slerp(other.orientation, part).normalize(),
+            orientation: turned_towards(self.orientation, other.orientation, part),
             jaw_rad: self.jaw_rad + (other.jaw_rad - self.jaw_rad) * part,
         }
     }
@@ -119,7 +119,7 @@ impl Instrument {
     /// Returns the place of a tip by its number, m, in the tissue's frame. Panics if there is no such tip.
     pub fn tip_m(&self, number: usize, pose: &InstrumentPose) -> DVec3 {
         let InstrumentTip { offset_m, part, .. } = self.tips[number];
-        let turn = DQuat::from_rotation_z(part.turn() * pose.jaw_rad);
+        let turn = about_z(part.turn() * pose.jaw_rad);
         let in_frame_m = match part {
             InstrumentPart::Body => offset_m,
             _ => self.hinge_m + turn * (offset_m - self.hinge_m),
@@ -144,6 +144,26 @@ impl Instrument {
         };
         forces_n.into_iter().map(of).sum()
     }
+}
+
+/// Cosine of half an angle from which on two orientations are so near that a straight line between them is exact to rounding.
+const NEARLY_EQUAL: f64 = 1.0 - 1e-12;
+
+/// Returns the rotation by an angle about z. (glam's own takes sine and cosine from the system, whose last digits differ.)
+fn about_z(angle_rad: f64) -> DQuat {
+    DQuat::from_xyzw(0.0, 0.0, libm::sin(0.5 * angle_rad), libm::cos(0.5 * angle_rad))
+}
+
+/// Returns the orientation at a part of the shorter turn from one to another, with the same bits on every system.
+fn turned_towards(from: DQuat, to: DQuat, part: f64) -> DQuat {
+    let cosine = from.dot(to);
+    let (to, cosine) = if cosine < 0.0 { (-to, -cosine) } else { (to, cosine) };
+    if cosine > NEARLY_EQUAL {
+        return (from * (1.0 - part) + to * part).normalize();
+    }
+    let angle_rad = libm::acos(cosine);
+    let weight = |part: f64| libm::sin(part * angle_rad);
+    (from * weight(1.0 - part) + to * weight(part)).normalize()
 }
 
 #[cfg(test)]
