@@ -21,10 +21,7 @@ const BOX: &str = "[solid]\nfile = \"box.obj\"\nunit = \"m\"\nfixed = [{ plane_m
 
 fn model(size_m: DVec3, cell_m: f64) -> Arc<Model> {
     let folder = tempfile::tempdir().unwrap();
-    let corner = |n: u8| DVec3::from_array([0, 1, 2].map(|axis| f64::from(n >> axis & 1))) * size_m;
-    let vertices = (0..8).map(corner).map(|at| format!("v {:?} {:?} {:?}\n", at.x, at.y, at.z));
-    let quads = ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"].map(|quad| format!("f {quad}\n"));
-    std::fs::write(folder.path().join("box.obj"), vertices.chain(quads).collect::<String>()).unwrap();
+    std::fs::write(folder.path().join("box.obj"), common::box_obj(size_m, DQuat::IDENTITY)).unwrap();
     let sets = [format!("solid.cell_m={cell_m:?}")];
     let scene = Scene::parse_in(folder.path(), "box", BOX, &sets, &Limits::default()).unwrap();
     Model::compile(&scene, &Limits::default()).unwrap()

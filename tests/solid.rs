@@ -526,11 +526,7 @@ fn a_beam_bends_under_its_weight_however_it_lies_in_the_lattice() {
     let ends_m = |turn: DQuat| {
         let (axis, up) = (turn * DVec3::X, turn * DVec3::Z);
         let folder = tempfile::tempdir().unwrap();
-        let corner = |n: u8| turn * (DVec3::from_array([0, 1, 2].map(|axis| f64::from(n >> axis & 1))) * size_m);
-        let vertices = (0..8).map(corner).map(|at| format!("v {:?} {:?} {:?}\n", at.x, at.y, at.z));
-        let quads =
-            ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"].map(|quad| format!("f {quad}\n"));
-        std::fs::write(folder.path().join("beam.obj"), vertices.chain(quads).collect::<String>()).unwrap();
+        std::fs::write(folder.path().join("beam.obj"), common::box_obj(size_m, turn)).unwrap();
         let text = format!(
             "[solid]\nfile = \"beam.obj\"\nunit = \"m\"\ncell_m = 0.003\n\
              fixed = [{{ plane_m = [0, 0, 0], normal = {:?}, within_m = 0.0 }}]\n\

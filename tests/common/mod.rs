@@ -11,6 +11,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use glam::{DQuat, DVec3};
 use palpate_session::Session;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
@@ -82,3 +83,11 @@ coefficient_n_s_per_m = 0.2
 [stepping]
 precision = "f64"
 "#;
+
+/// The corners of a box and its triangles as an OBJ file, m, each place turned by `turn`.
+pub fn box_obj(size_m: DVec3, turn: DQuat) -> String {
+    let corner = |n: u8| turn * (DVec3::from_array([0, 1, 2].map(|axis| f64::from(n >> axis & 1))) * size_m);
+    let vertices = (0..8).map(corner).map(|at| format!("v {:?} {:?} {:?}\n", at.x, at.y, at.z));
+    let quads = ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"].map(|quad| format!("f {quad}\n"));
+    vertices.chain(quads).collect()
+}
