@@ -143,7 +143,9 @@ impl Tool {
         let outward = self.footprint.outward(&along);
         let gap_m = place_m - surface_m;
         if let Some(off_m) = rigid.off_m(gap_m, outward).filter(|_| was_pressing) {
+            let (_, rest_outward) = self.footprint.at_rest();
             self.footprint.shift(model, off_m.clamp_length_max(self.footprint.stride_m()), &along);
+            work.add(rigid.turn(model, layout, state, place_m, [rest_outward, self.footprint.at_rest().1]));
         }
         (self.normal, self.side, self.is_new) = (outward, Some(1.0), false);
         if !was_pressing && rigid.is_far(gap_m) {
@@ -164,7 +166,7 @@ impl Tool {
                 work.add(applied.work_along(model, plan, layout, point, movement.to_array()) * unit_j);
             }
         }
-        work.add(pressed.force_n.dot(pressed.moved_m));
+        work.add(pressed.force_n.dot(pressed.moved_m) + pressed.entered_j);
         match pressed.contact_state {
             Some(contact_state) => {
                 (self.contact_state, self.force_n, self.steady_n) = (contact_state, pressed.force_n, pressed.force_n);

@@ -27,6 +27,10 @@
 //!
 //! Friction holds a sample to the movement of the tip, by a force across d of at most μ·f.
 //!
+//! A disc turns as the surface at rest does along which it slides, and begins with the direction of the surface that it meets.
+//! (One that kept its direction dug its rim into a curved surface that it slid over, and jumped; one that the torque of its
+//! samples turns tips over when it is as deep as its radius.)
+//!
 //! A tool that is placed within the tissue, or that jumps into it, comes in along its axis at a bounded speed
 //! ([`MAX_DEEPENING`]). The work of a tool is F·ẋ with x the place that it has then.
 
@@ -134,6 +138,10 @@ struct TouchedSample {
     slip_m: DVec3,
     /// Change of the force with the depth, N/m.
     stiffness_n_per_m: f64,
+    /// Whether the rim of a disc has come over it.
+    enters: bool,
+    /// Depth by which it may be deeper than its force at the end of the last substep says, m.
+    sudden_m: f64,
 }
 
 /// Where samples were taken: the place, its rest position, m, and the unit normal out of the tissue there.
@@ -152,6 +160,8 @@ pub(crate) struct TipPress {
     /// Movement of the place that the tip had, m.
     pub(crate) moved_m: DVec3,
     pub(crate) contact_state: Option<ContactState>,
+    /// Energy that the contact takes with the samples that the rim of a disc has come over, J.
+    pub(crate) entered_j: f64,
 }
 
 /// How the tip of a tool presses.
@@ -451,7 +461,7 @@ impl RigidTip {
         let too_deep_m = |tip: &Self| {
             let over = tip.touched.iter().filter(|touched| touched.stiffness_n_per_m > 0.0).map(|touched| {
                 let pressed_n = tip.forces_n[touched.sample].dot(touched.way).max(0.0);
-                touched.deep_m - pressed_n / touched.stiffness_n_per_m - 2.0 * deeper_m
+                touched.deep_m - pressed_n / touched.stiffness_n_per_m - touched.sudden_m
             });
             over.fold(0.0, f64::max)
         };
@@ -462,7 +472,7 @@ impl RigidTip {
             // Where the axis is not the way out of the tip, some are still too deep.
             for touched in &mut self.touched {
                 let pressed_n = self.forces_n[touched.sample].dot(touched.way).max(0.0);
-                let most_m = pressed_n / touched.stiffness_n_per_m.max(f64::MIN_POSITIVE) + 4.0 * deeper_m;
+                let most_m = pressed_n / touched.stiffness_n_per_m.max(f64::MIN_POSITIVE) + 2.0 * touched.sudden_m;
                 touched.deep_m = touched.deep_m.min(most_m);
             }
         }
@@ -476,7 +486,9 @@ impl RigidTip {
             is_pressing |= force_n != DVec3::ZERO;
             let stiffness = self.stiffness_n_per_m[touched.sample];
             if stiffness > 0.0 {
-                self.stored_j += stored_j(stiffness, force_n.dot(touched.way), to_core_m(&self.tip));
+                let stored_j = stored_j(stiffness, force_n.dot(touched.way), to_core_m(&self.tip));
+                self.stored_j += stored_j;
+                pressed.entered_j += if touched.enters { stored_j } else { 0.0 };
             }
         }
         if is_pressing {
@@ -486,6 +498,30 @@ impl RigidTip {
         }
         self.spread();
         pressed
+    }
+
+    /// Turns a disc as the surface at rest turns between two outward normals, while the tool is at `place_m`. Returns the work that
+    /// this takes, J.
+    pub(crate) fn turn<T: Real>(
+        &mut self,
+        model: &Model,
+        layout: &Layout,
+        state: &State<T>,
+        place_m: DVec3,
+        [from, to]: [DVec3; 2],
+    ) -> f64 {
+        let turn = from.cross(to);
+        if self.tip.shape == TipShape::Sphere || turn == DVec3::ZERO {
+            return 0.0;
+        }
+        self.axis = (self.axis + turn.cross(self.axis)).normalize();
+        let mut torque_n_m = DVec3::ZERO;
+        for (sample, force_n) in self.samples.iter().zip(&self.forces_n).filter(|(_, force_n)| **force_n != DVec3::ZERO)
+        {
+            let moved_m = sample.mean(|node| displacement_m(model, layout, state, self.nodes[node].point));
+            torque_n_m += (sample.rest_m + moved_m - place_m).cross(*force_n);
+        }
+        torque_n_m.dot(turn)
     }
 
     /// Finds the samples within the tip, and those that it pressed before.
@@ -524,6 +560,11 @@ impl RigidTip {
             };
             let moves = sample.mean(movement);
             let slip_m = model.unit_m * moves - own_m;
+            // At the rim of a disc a sample may come in at any depth: its force begins at 0.
+            let whole_n_per_m = model.youngs_modulus_pa() * sample.relative_stiffness_m;
+            let enters = force_n == DVec3::ZERO && stiffness_n_per_m < whole_n_per_m;
+            let sudden_m =
+                2.0 * MAX_DEEPENING * model.unit_m * whole_n_per_m / stiffness_n_per_m.max(f64::MIN_POSITIVE);
             // The tangent of the law.
             let part = (deep_m / to_core_m).clamp(0.0, LARGEST_PART);
             let stiffness_n_per_m = stiffness_n_per_m / (1.0 - part).powi(2);
@@ -534,6 +575,8 @@ impl RigidTip {
                 deep_m,
                 slip_m: slip_m - slip_m.dot(way) * way,
                 stiffness_n_per_m,
+                enters,
+                sudden_m,
             });
         }
     }
