@@ -20,7 +20,9 @@
 use std::sync::Arc;
 
 use crate::audit_window::{AuditWindow, Mark, SharedCheckpoint, WindowInputs};
+use crate::body::Places;
 use crate::body::model::Model;
+use crate::body::solid::is_inverted;
 use crate::body::tables::springs_of;
 use crate::interface::{BlowUp, CheckFailure, PointState, Released, Tissue};
 use crate::kernel::field::{Field, State};
@@ -290,10 +292,7 @@ impl<T: Real> TissueState<T> {
         if let Some(checkpoint) = &self.checkpoint {
             self.tiles.largest = checkpoint.largest;
         }
-        let model = self.model.clone();
-        self.tiles.begin_anew(model.tile_tolerance());
-        self.audit_window.give_up();
-        self.exchange(&model);
+        self.begin_anew();
         self.steps = step;
         self.begin_account();
         for tool in &tools {
@@ -301,6 +300,36 @@ impl<T: Real> TissueState<T> {
         }
         self.known_volume_change.set(None);
         Released { tools, at_rest }
+    }
+
+    /// Returns whether no point moves and nothing holds the tissue, and yet a solid is inside out somewhere. (Gravity could do that
+    /// to a solid at rest.)
+    pub(super) fn rests_inverted(&self) -> bool {
+        let TissueState { model, tables, state, applied, prescribed, contacts, tiles, .. } = self;
+        let is_free = prescribed.is_empty() && contacts.are_free() && applied.is_settled() && !applied.pushes();
+        let Places::Solid(places) = &model.places else { return false };
+        is_free
+            && tiles.region.tiles().is_empty()
+            && !model.places.is_pulled()
+            && is_inverted(places, &tables.layout, &state.u)
+    }
+
+    /// Brings a tissue that nothing holds to its shape at rest.
+    pub(super) fn return_to_rest_shape(&mut self) {
+        self.guard_events += 1;
+        self.known_volume_change.set(None);
+        self.state = State::at_rest(&self.tables.layout, self.state.kept.len());
+        self.begin_anew();
+        self.begin_account();
+    }
+
+    /// Continues from the present displacements and velocities with the model's own substep and without a history; all tiles are
+    /// awake.
+    fn begin_anew(&mut self) {
+        let model = self.model.clone();
+        self.tiles.begin_anew(model.tile_tolerance());
+        self.audit_window.give_up();
+        self.exchange(&model);
     }
 
     /// Uses `model`, which has the same points and number format, from the next step on.

@@ -156,6 +156,9 @@ impl<T: Real> TissueState<T> {
             let volume_change = self.tables.press(&self.state.u, self.tiles.region.tiles());
             let (mut context, prescribed, contacts) = self.parts();
             put_to_sleep(&mut context, prescribed, contacts, volume_change);
+            if self.rests_inverted() {
+                self.return_to_rest_shape();
+            }
         }
         self.ended(StepStage::Sleep);
     }

@@ -163,6 +163,11 @@ impl<T: Real> Applied<T> {
         self.settled
     }
 
+    /// Returns whether a tool pushes.
+    pub(crate) fn pushes(&self) -> bool {
+        self.slots.iter().any(|slot| slot.push.is_some())
+    }
+
     /// Returns the changes of force since the last call, up to the end of step `step`.
     pub(crate) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = ForceChange> {
         let end = Moment { step, fraction: 1.0 };

@@ -220,6 +220,11 @@ impl Contacts {
         self.tools.is_empty()
     }
 
+    /// Returns whether none of these tools touches or holds the tissue.
+    pub(crate) fn are_free(&self) -> bool {
+        self.tools.iter().all(|tool| tool.contact_state == ContactState::Free)
+    }
+
     /// Returns the numbers of these tools.
     pub(crate) fn tools(&self) -> impl Iterator<Item = usize> {
         self.tools.iter().map(|tool| tool.number)

@@ -8,6 +8,7 @@
 //! μ|F|²/2 over the cube does. So one evaluation a cube suffices, and nothing locks.
 
 pub(crate) mod footprint;
+pub(crate) mod inversion;
 pub(crate) mod linear_cells;
 pub(crate) mod neo_hookean;
 pub(crate) mod places;
@@ -16,6 +17,7 @@ pub(crate) mod sweep;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use inversion::is_inverted;
 pub(crate) use neo_hookean::NeoHookean;
 pub(crate) use places::SolidPlaces;
 pub(crate) use sweep::{PointLoad, SolidGrid, SolidSweep, SolidTables, gather};
