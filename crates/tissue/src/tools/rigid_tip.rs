@@ -74,8 +74,10 @@ const OFF: f64 = 1.0 / 64.0;
 /// A tip goes deeper by at most this part of a cell in a substep, and what it does not follow decreases by as much.
 const MAX_DEEPENING: f64 = 0.05;
 
-/// The cosine between the outward normal of a sample and the direction from which a tip may press it.
+/// The cosine between the outward normal of a sample and the direction from which a tip presses it: none of the sample counts up
+/// to the first, all from the second on. A sample that counted at once, as deep as it was, would make the tip jump.
 const FACING: f64 = 0.1;
+const FACING_WHOLLY: f64 = 0.2;
 
 /// A sample whose points can move less than this part of what one free point with all of its weight would is as good as fixed,
 /// and the tip does not feel it.
@@ -136,6 +138,8 @@ struct TouchedSample {
     deep_m: f64,
     /// Movement along the surface relative to the tip before the impulses, m.
     slip_m: DVec3,
+    /// s·A of the part of the sample that counts, N/m.
+    counted_n_per_m: f64,
     /// Change of the force with the depth, N/m.
     stiffness_n_per_m: f64,
     /// Whether the rim of a disc has come over it.
@@ -484,9 +488,8 @@ impl RigidTip {
             let force_n = self.forces_n[touched.sample];
             pressed.force_n += force_n;
             is_pressing |= force_n != DVec3::ZERO;
-            let stiffness = self.stiffness_n_per_m[touched.sample];
-            if stiffness > 0.0 {
-                let stored_j = stored_j(stiffness, force_n.dot(touched.way), to_core_m(&self.tip));
+            if touched.counted_n_per_m > 0.0 {
+                let stored_j = stored_j(touched.counted_n_per_m, force_n.dot(touched.way), to_core_m(&self.tip));
                 self.stored_j += stored_j;
                 pressed.entered_j += if touched.enters { stored_j } else { 0.0 };
             }
@@ -547,9 +550,10 @@ impl RigidTip {
                 TipShape::Sphere => (from_m.try_normalize().unwrap_or(-axis), radius_m - from_m.length()),
                 TipShape::RigidDisc | TipShape::Disc => (-axis, from_m.dot(axis)),
             };
-            let faces = way.dot(sample.outward) < -FACING && sample.relative_inverse_mass > FIXED_PART;
-            let stiffness_n_per_m = if faces { self.stiffness_n_per_m[number] } else { 0.0 };
-            let touches = stiffness_n_per_m > 0.0 && deep_m > 0.0 && deep_m < 2.0 * radius_m;
+            let facing = ((-way.dot(sample.outward) - FACING) / (FACING_WHOLLY - FACING)).clamp(0.0, 1.0);
+            let yields = sample.relative_inverse_mass > FIXED_PART;
+            let counted_n_per_m = if yields { facing * self.stiffness_n_per_m[number] } else { 0.0 };
+            let touches = counted_n_per_m > 0.0 && deep_m > 0.0 && deep_m < 2.0 * radius_m;
             if !touches && force_n == DVec3::ZERO {
                 continue;
             }
@@ -560,20 +564,20 @@ impl RigidTip {
             };
             let moves = sample.mean(movement);
             let slip_m = model.unit_m * moves - own_m;
-            // At the rim of a disc a sample may come in at any depth: its force begins at 0.
+            // At the rim of a disc, or beginning to face a sphere, a sample may come in at any depth: its force begins at 0.
             let whole_n_per_m = model.youngs_modulus_pa() * sample.relative_stiffness_m;
-            let enters = force_n == DVec3::ZERO && stiffness_n_per_m < whole_n_per_m;
-            let sudden_m =
-                2.0 * MAX_DEEPENING * model.unit_m * whole_n_per_m / stiffness_n_per_m.max(f64::MIN_POSITIVE);
+            let enters = force_n == DVec3::ZERO && counted_n_per_m < whole_n_per_m;
+            let sudden_m = 2.0 * MAX_DEEPENING * model.unit_m * whole_n_per_m / counted_n_per_m.max(f64::MIN_POSITIVE);
             // The tangent of the law.
             let part = (deep_m / to_core_m).clamp(0.0, LARGEST_PART);
-            let stiffness_n_per_m = stiffness_n_per_m / (1.0 - part).powi(2);
+            let stiffness_n_per_m = counted_n_per_m / (1.0 - part).powi(2);
             let deep_m = if touches { deep_m - part * part * to_core_m } else { deep_m.min(0.0) };
             self.touched.push(TouchedSample {
                 sample: number,
                 way,
                 deep_m,
                 slip_m: slip_m - slip_m.dot(way) * way,
+                counted_n_per_m,
                 stiffness_n_per_m,
                 enters,
                 sudden_m,
