@@ -2,6 +2,7 @@
 
 import { spawn, spawnSync } from "node:child_process";
 import { existsSync, mkdirSync } from "node:fs";
+import { tmpdir } from "node:os";
 import { delimiter, join, resolve } from "node:path";
 import { createInterface } from "node:readline";
 import { after, before } from "node:test";
@@ -33,7 +34,10 @@ function browserProgram() {
   const line = "apt-get install -y chromium";
   if (process.getuid?.() === 0 && spawnSync("apt-get", ["--version"]).status === 0) {
     console.error(`There is no browser on this machine: ${line}`);
-    spawnSync("sh", ["-c", `apt-get update -q && ${line}`], { stdio: ["ignore", "ignore", "inherit"] });
+    // Files of tests run at the same time: the first installs it, and the others wait.
+    const lock = join(tmpdir(), "palpate-browser.lock");
+    const once = `command -v ${NAMES.join(" || command -v ")} || { apt-get update -q && ${line}; }`;
+    spawnSync("flock", [lock, "sh", "-c", once], { stdio: ["ignore", "ignore", "inherit"] });
     const now = installed();
     if (now) return now;
   }
