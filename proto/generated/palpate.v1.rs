@@ -1509,7 +1509,8 @@ pub enum TipShape {
     Unspecified = 0,
     /// A disc that presses with an even pressure and lies on the surface. The tool's place is the mean of the surface over it.
     Disc = 1,
-    /// A flat rigid disc that keeps the direction in which it met the tissue. The tool's place is its middle. Solids only.
+    /// A flat rigid disc. It begins with the direction of the surface that it meets, and turns as that does at rest along its
+    /// way. The tool's place is its middle. Solids only.
     RigidDisc = 2,
     /// A rigid sphere. The tool's place is its centre. Solids only.
     Sphere = 3,
@@ -3242,7 +3243,8 @@ pub struct Session {
     /// Time without a call, a held tool or a stream after which the session is deleted, s.
     #[prost(double, tag = "16")]
     pub idle_timeout_s: f64,
-    /// How often the guard detected instability, returned to a checkpoint and repeated it with half the substep.
+    /// How often the guard detected instability, returned to a checkpoint and repeated it with half the substep; or brought a
+    /// solid that rested inside out to its shape.
     #[prost(uint64, tag = "17")]
     pub guard_events: u64,
     /// Expected error of displacement and force, relative to the largest of each. Always finite: 1 if it is unknown.

@@ -215,7 +215,7 @@ const COUNTS: CounterTable = [
         &tally.paused_commands
     }),
     ("lapsed_leases", "Leases of tools that expired", |tally| &tally.lapsed_leases),
-    ("guard_events", "Returns of the guard to a checkpoint", |tally| &tally.guard_events),
+    ("guard_events", "Returns of the guard to a checkpoint, or of a solid to its shape", |tally| &tally.guard_events),
     ("recoveries", "Returns of a tissue to an earlier state", |tally| &tally.recoveries),
     ("held_sessions", "Sessions stopped by an instability, a bug of the program or lack of memory", |tally| {
         &tally.held_sessions

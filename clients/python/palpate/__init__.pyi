@@ -177,7 +177,8 @@ class Session:
         """Number of points that the last step computed; the others are at rest."""
     @property
     def guard_events(self) -> int:
-        """How often the guard went back to a checkpoint and halved the substep."""
+        """How often the guard went back to a checkpoint and halved the substep, or brought a solid that rested inside out to its
+        shape."""
     @property
     def fault(self) -> Optional[str]:
         """Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None if

@@ -24,7 +24,8 @@ pub enum TipShape {
     /// mean of the surface over the disc.
     #[default]
     Disc,
-    /// A flat rigid disc. It keeps the direction in which it met the tissue. The place of the tool is its middle.
+    /// A flat rigid disc. It begins with the direction of the surface that it meets, and turns as that does at rest along its
+    /// way. The place of the tool is its middle.
     RigidDisc,
     /// A rigid sphere. The place of the tool is its centre.
     Sphere,

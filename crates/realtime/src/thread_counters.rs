@@ -87,7 +87,7 @@ pub struct ThreadCounters {
     pub paused_commands: Count,
     /// Tools whose lease expired.
     pub lapsed_leases: Count,
-    /// Returns of the guard to a checkpoint, from which it repeated steps with a shorter substep.
+    /// Returns of the guard to a checkpoint, from which it repeated steps with a shorter substep, or of a solid to its shape.
     pub guard_events: Count,
     /// Recoveries: returns of a tissue to an earlier state.
     pub recoveries: Count,

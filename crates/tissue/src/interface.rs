@@ -217,7 +217,8 @@ pub trait Tissue: Send {
     /// 4 times ([`MAX_HALVINGS`](crate::state::guard::MAX_HALVINGS)).
     fn plan(&self) -> &Plan;
     /// Returns how many times the guard went back to a checkpoint and repeated the steps since with a shorter
-    /// substep, successfully. Several halvings for one fault count once; a blow-up does not count.
+    /// substep, successfully, or brought a solid that rested inside out to its shape. Several halvings for one fault count once; a
+    /// blow-up does not count.
     fn guard_events(&self) -> u64;
     /// Returns the step of the state that a blow-up would go back to. Without a checkpoint (a still tissue, or
     /// one that has not moved yet) it is the present step.

@@ -14,6 +14,8 @@
 //! the scheme's history begins anew, as after a change of model. So the result depends on the
 //! checkpoint alone.
 //!
+//! A solid that nothing holds, and that falls asleep inside out, gets its shape at rest: no motion would bring it there.
+//!
 //! A checkpoint just after a change of tissue or a recovery has passed no check: the fault may be in that very
 //! state. Then the tissue continues at rest, which is safe for any tissue.
 

@@ -142,7 +142,7 @@ struct TouchedSample {
     counted_n_per_m: f64,
     /// Change of the force with the depth, N/m.
     stiffness_n_per_m: f64,
-    /// Whether the rim of a disc has come over it.
+    /// Whether it had no force, and counts in part.
     enters: bool,
     /// Depth by which it may be deeper than its force at the end of the last substep says, m.
     sudden_m: f64,
@@ -164,7 +164,7 @@ pub(crate) struct TipPress {
     /// Movement of the place that the tip had, m.
     pub(crate) moved_m: DVec3,
     pub(crate) contact_state: Option<ContactState>,
-    /// Energy that the contact takes with the samples that the rim of a disc has come over, J.
+    /// Energy of the samples that begin to count while the tip is deeper than they are, J.
     pub(crate) entered_j: f64,
 }
 

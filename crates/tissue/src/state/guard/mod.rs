@@ -9,6 +9,8 @@
 //! If a check fails, the tissue goes back to the last checkpoint and repeats the tools' inputs since then with
 //! half the substep; observers never see time go back. It keeps the shorter substep. After [`MAX_HALVINGS`]
 //! halvings the guard gives up, at the checkpoint.
+//!
+//! A solid that comes to rest inside out is at rest in a shape that no material has; the guard sets it to its own.
 
 pub(crate) mod checkpoint;
 pub(crate) mod survey;
