@@ -165,7 +165,8 @@ impl Session {
         self.with(py, |inner| inner.simulation.session.tissue().awake_points())
     }
 
-    /// How often the guard went back to a checkpoint and halved the substep, or brought a solid to its shape.
+    /// How often the guard went back to a checkpoint and halved the substep, or brought a solid that rested
+    /// inside out to its shape.
     #[getter]
     fn guard_events(&self, py: Python<'_>) -> u64 {
         self.with(py, |inner| inner.simulation.session.tissue().guard_events())

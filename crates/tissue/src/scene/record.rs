@@ -165,7 +165,8 @@ pub struct Summary {
     pub ns_per_point_substep: f64,
     /// Fraction, 0 to 1, of all point-substeps that were computed; the rest slept.
     pub computed_fraction: f64,
-    /// How many times the guard went back and repeated with a shorter substep, or brought a solid to its shape.
+    /// How many times the guard went back and repeated with a shorter substep, or brought a solid that rested
+    /// inside out to its shape.
     pub guard_events: u64,
     /// XXH3-128 hash of the final state (`Tissue::state_hash`), 32 hexadecimal
     /// digits.
