@@ -54,7 +54,9 @@ impl WorkAccount {
 
     /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so far and
     /// belongs to the next interval. The account then begins anew. Only the excess while tools touch or hold
-    /// (`is_touched`) is kept, so that a small gain in every interval can't continue forever.
+    /// (`is_touched`) is kept, so that a small gain in every interval can't continue forever. At most [`MARGIN`] of the
+    /// present energy is kept: when tools release what they had pressed, the excess goes with the energy, and an energy
+    /// that only falls passes.
     pub(crate) fn survey(
         &mut self,
         energy_j: f64,
@@ -72,7 +74,8 @@ impl WorkAccount {
         }
         // Below rest that of a weight is negative.
         let largest_j = self.largest_j.max(energy_j.abs());
-        *self = WorkAccount { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
+        let excess_j = excess_j.clamp(0.0, MARGIN * energy_j.abs());
+        *self = WorkAccount { done_j: present_j, energy_j, largest_j, excess_j };
         Ok(())
     }
 }
@@ -102,6 +105,14 @@ mod tests {
         assert_eq!({ touched }.survey(1.06, 0.0, EXACT, false), Ok(()));
         assert_eq!(touched.survey(1.0, 0.0, EXACT, true), Ok(()));
         assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
+        // What is left of a press that is released can't fail for the excess of the press.
+        let mut released = begun;
+        released.add(1.0);
+        assert_eq!(released.survey(2.09, 0.0, EXACT, true), Ok(()));
+        released.add(-2.08);
+        assert_eq!(released.survey(0.01, 0.0, EXACT, true), Ok(()));
+        assert_eq!(released.survey(0.009, 0.0, EXACT, true), Ok(()));
+        assert!(released.survey(0.01, 0.0, EXACT, true).is_err());
         // Rounding noise does not count as energy.
         let rounding = Noise { energy_j: 1e-27, ..EXACT };
         assert_eq!(WorkAccount::default().survey(1e-30, 0.0, rounding, true), Ok(()));
