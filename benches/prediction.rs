@@ -132,8 +132,10 @@ fn disturbed(report: &mut BenchReport, seeds: u64) {
         ("50 ± 10 ms, 0.1 % lost, stream", "--profile wan"),
         ("200 ms, datagrams", "--rtt-ms 200 --transport datagram"),
         ("both deadbands (0.1, 0.05), datagrams", "--rtt-ms 50 --transport datagram --deadband 0.1 --up-deadband 0.05"),
-        ("second tool 10 mm away", "--rtt-ms 50 --second-tool-mm 10"),
-        ("second tool 5 mm away", "--rtt-ms 50 --second-tool-mm 5"),
+        ("another client's tool 15 mm away", "--rtt-ms 50 --second-tool-mm 15"),
+        ("another client's tool 5 mm away", "--rtt-ms 50 --second-tool-mm 5"),
+        ("a tool of the own second hand 15 mm away", "--rtt-ms 50 --second-tool-mm 15 --second-hand own"),
+        ("a tool of the own second hand 5 mm away", "--rtt-ms 50 --second-tool-mm 5 --second-hand own"),
         ("changing tissue", "--rtt-ms 50 --tissue-change-s 10 --tissue-change-factor 1.5"),
     ];
     let runs = conditions.map(|(title, condition)| (title, format!("--scene liver-organ {condition}")));
@@ -254,7 +256,7 @@ fn times_us(model: &Arc<Model>) -> Vec<f64> {
         let stroke_m = 0.008 * (3.0 * (time_s - 0.2).max(0.0)).sin();
         let place_m: DVec3 = at_m - depth_m * outward + stroke_m * along;
         let began = Instant::now();
-        std::hint::black_box(copy.feel(time_s, place_m));
+        std::hint::black_box(copy.feel(time_s, place_m, &[]));
         1e6 * began.elapsed().as_secs_f64()
     });
     // From when it touches on.

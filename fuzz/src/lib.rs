@@ -327,6 +327,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         touch_stiffness: true,
         datagrams: true,
         lease_id: "0123456789abcdef0123456789abcdef".into(),
+        other_tools: true,
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
     let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));

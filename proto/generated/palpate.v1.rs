@@ -468,6 +468,10 @@ pub struct TouchOpen {
     /// it.
     #[prost(string, tag = "12")]
     pub lease_id: ::prost::alloc::string::String,
+    /// Samples contain `other_tools`. For a client that steps a copy of the tissue: it feels what the others do without
+    /// waiting for the samples of its own tool.
+    #[prost(bool, tag = "13")]
+    pub other_tools: bool,
 }
 impl ::prost::Name for TouchOpen {
     const NAME: &'static str = "TouchOpen";
@@ -1022,6 +1026,10 @@ pub struct Sample {
     /// On a server of a fleet: Ownership.revision. Ignore a sample with a revision below one that you have seen.
     #[prost(uint64, tag = "15")]
     pub ownership_revision: u64,
+    /// With TouchOpen.other_tools: the tools that this stream does not hold and that are led by poses, by ascending
+    /// number; of more than 32 the first.
+    #[prost(message, repeated, tag = "16")]
+    pub other_tools: ::prost::alloc::vec::Vec<OtherTool>,
 }
 impl ::prost::Name for Sample {
     const NAME: &'static str = "Sample";
@@ -1031,6 +1039,30 @@ impl ::prost::Name for Sample {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Sample".into()
+    }
+}
+/// A tool of another stream at the end of a step.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct OtherTool {
+    #[prost(uint32, tag = "1")]
+    pub tool: u32,
+    /// Position of the tip.
+    #[prost(message, optional, tag = "2")]
+    pub position_m: ::core::option::Option<Vector3>,
+    /// Its velocity in the last step.
+    #[prost(message, optional, tag = "3")]
+    pub velocity_m_per_s: ::core::option::Option<Vector3>,
+    #[prost(message, optional, tag = "4")]
+    pub tip: ::core::option::Option<Tip>,
+}
+impl ::prost::Name for OtherTool {
+    const NAME: &'static str = "OtherTool";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.OtherTool".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.OtherTool".into()
     }
 }
 /// One tool at the end of a step.

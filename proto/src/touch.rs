@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 use palpate_haptics::force_law::{Law, Row};
-use palpate_haptics::{ContactState, Coupling, Device, LocalModel, Tip, TipShape};
+use palpate_haptics::{ContactState, Coupling, Device, LocalModel, MotionState, OtherTool, Tip, TipShape};
 
 use crate::geometry::{from_vector, point, vector};
 use crate::pb;
@@ -85,6 +85,25 @@ pub fn tip(tip: &Tip) -> pb::Tip {
             }
         },
     }
+}
+
+/// Converts a tool of another stream to a message. Its time is that of the sample.
+pub fn other_tool(other: &OtherTool) -> pb::OtherTool {
+    pb::OtherTool {
+        tool: other.tool,
+        position_m: vector(other.motion.place_m),
+        velocity_m_per_s: vector(other.motion.velocity_m_per_s),
+        tip: Some(tip(&other.tip)),
+    }
+}
+
+/// Returns the tool of another stream in a message, at the time `time_s` of the client's clock; `None` if its tip has a
+/// shape that this program does not know. Absent vectors become 0.
+pub fn from_other_tool(message: &pb::OtherTool, time_s: f64) -> Option<OtherTool> {
+    let (place_m, velocity_m_per_s) =
+        (from_vector(message.position_m.as_ref()), from_vector(message.velocity_m_per_s.as_ref()));
+    let motion = MotionState { time_s, place_m, velocity_m_per_s };
+    Some(OtherTool { tool: message.tool, tip: from_tip("tip", message.tip.as_ref()).ok()?, motion })
 }
 
 /// Creates the pose of a tool whose tip is at `place_m` in the tissue's frame, m, without orientation, offset or

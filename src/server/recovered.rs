@@ -60,6 +60,7 @@ mod tests {
             recoveries,
             recovered: (recoveries > 0).then(|| Arc::new(Recovered { recovery, tools })),
             tools: Vec::new(),
+            other_tools: Vec::new(),
         }
     }
 

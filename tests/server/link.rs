@@ -210,6 +210,26 @@ fn a_link_that_is_too_slow_for_all_is_fast_enough_for_news() {
     assert!(number(&news, "force_error_rms_percent") < 1.5, "{news}");
 }
 
+/// The copy has the second tool: a hand of this client's at once, another client's by samples.
+#[test]
+fn a_copy_feels_what_a_second_tool_does_to_the_tissue() {
+    let scenes = [("liver", 15), ("gallbladder", 5)];
+    for (scene, gap_mm) in scenes {
+        let run = |hand: &str| {
+            let second = format!("--second-tool-mm {gap_mm} --second-hand {hand}");
+            link(&format!(
+                "--scene {scene} --scheme prediction --transport datagram --rtt-ms 50 --loss 0.01 {second} --seconds 8"
+            ))
+        };
+        let [own, another, unknown] = ["own", "another", "unknown"].map(run);
+        let [own_percent, another_percent, unknown_percent] =
+            [&own, &another, &unknown].map(|found| number(found, "force_error_rms_percent"));
+        assert!(own_percent < 0.5, "{own}");
+        assert!(another_percent < 2.0 && another_percent < 0.7 * unknown_percent, "{another} {unknown}");
+        assert!(number(&own, "energy_min_j") >= -1e-6 && number(&another, "energy_min_j") >= -1e-4, "{own} {another}");
+    }
+}
+
 /// The truth has the second tool and the change of the tissue at the same moments as the server.
 #[test]
 fn what_else_happens_to_a_tissue_is_felt_by_the_truth_too() {

@@ -7,7 +7,8 @@
 //! 2. Soft engage. After `enable`, nothing is rendered until a model is known and its force is below
 //!    [`ENGAGE_BELOW_N`]. Then the force ramps in over [`ENGAGE_S`].
 //! 3. The norm of the force (clamping its components would turn it), and the device's continuous force.
-//! 4. Passivity: no more energy leaves the port than has entered it.
+//! 4. Passivity: no more energy leaves the port than has entered it, and than other tools have put into the tissue
+//!    ([`Envelope::supply`]).
 //! 5. Slew: the force changes by at most [`SLEW_N_PER_S`], up and down, in every state.
 //!
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick, as in the passivity observer
@@ -261,6 +262,15 @@ impl Envelope {
     pub fn reset(&mut self) {
         if self.state == RenderingState::Fault {
             self.state = RenderingState::Disabled;
+        }
+    }
+
+    /// Adds the work that other tools have done on the tissue since the last tick, J, to the energy that may leave the port: a
+    /// hand that another one moves through the tissue gets energy from it. Negative if they got back more than they gave. A
+    /// value that is not finite is ignored.
+    pub fn supply(&mut self, work_j: f64) {
+        if work_j.is_finite() {
+            self.tank_j = (self.tank_j + work_j).min(TANK_J);
         }
     }
 
@@ -604,5 +614,30 @@ mod tests {
             last_n = force_n;
         }
         assert!(port.envelope.count(LimitCause::Passivity).0 >= 25 && port.envelope.energy_j() > 0.0);
+    }
+
+    /// A hand at rest on the tissue, which another tool pushes out of it: with 1 N over 20 mm.
+    #[test]
+    fn a_hand_gets_the_energy_that_another_tool_puts_into_the_tissue_and_no_more() {
+        let rendered_j = |supplied_j: f64| {
+            let mut port = Port::new("omega3");
+            port.ticks(600, 0.0, 0.0);
+            for _ in 0..200 {
+                port.envelope.supply(supplied_j / 200.0);
+                port.tick(0.1, 1.0);
+            }
+            port.envelope.supply(f64::NAN);
+            port.ticks(100, 0.1, 0.0);
+            -port.envelope.energy_j()
+        };
+        let whole_j = rendered_j(0.03);
+        assert!((0.015..0.03).contains(&whole_j), "{whole_j} J");
+        for supplied_j in [0.0, 0.005, -0.005] {
+            let given_j = rendered_j(supplied_j);
+            assert!(
+                given_j <= 1.1 * CREDIT_J + supplied_j.max(0.0) && given_j < 0.5 * whole_j,
+                "{supplied_j}: {given_j} J"
+            );
+        }
     }
 }

@@ -77,6 +77,6 @@ pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use force_law::Law;
 pub use instrument::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Wrench};
 pub use local_model::{ContactState, LocalModel, Touching, Track};
-pub use prediction::{Predicted, Prediction, Predictor};
+pub use prediction::{OtherTool, Predicted, Prediction, Predictor};
 pub use renderer::Renderer;
 pub use tip::{Coupling, Tip, TipShape};

@@ -8,9 +8,15 @@
 //!
 //! **Correction by samples.** Each sample shows the error of the copy at the sample's own time t₀: e = f(t₀) − c(t₀),
 //! where c is the copy's force. The rendered force is c(now) + e, with e reduced to the fraction |c(now)|/|c(t₀)| if
-//! that is below 1, so that the force falls smoothly when a tip leaves the tissue. What only the server knows, such
-//! as another user's tool, takes effect a round trip late. If the server's tool was a little beside the client's at
+//! that is below 1, so that the force falls smoothly when a tip leaves the tissue. What only the server knows takes effect a
+//! round trip late. If the server's tool was a little beside the client's at
 //! t₀ (because a place was lost or not sent), the local model gives f at the client's place.
+//!
+//! **Other tools.** The copy has those that the client knows ([`OtherTool`]): its own second tool at once, and those of
+//! other clients by samples, from which they go on at constant velocity. At t₀ the server had another client's tool where
+//! that is half a round trip after the copy had it there, so e contains what it did in that time, to and fro. While such a
+//! tool moves, e is therefore the mean over some tenths of a second. The work that the other tools do on the copy may leave
+//! the client's port ([`crate::Envelope::supply`]).
 //!
 //! **Selection.** The local model is also computed beside the copy. When a sample arrives, both forecasts for t₀ are
 //! compared with it. If the copy's error over some tenths of a second is larger than the local model's, and larger
@@ -22,9 +28,11 @@ use std::collections::VecDeque;
 
 use glam::DVec3;
 
+use crate::dead_reckoning::MotionState;
 use crate::local_model::{ContactState, is_after};
+use crate::tip::Tip;
 
-/// Time constant of the memory with which forecasts are compared, s.
+/// Time constant of the memory with which forecasts are compared, and of the mean error while other tools move, s.
 const MEMORY_S: f64 = 0.3;
 
 /// Factor by which the other one's mean squared error must be smaller before it is rendered. It prevents frequent
@@ -44,15 +52,42 @@ pub struct Predicted {
     pub force_n: DVec3,
     /// State of contact between the tool and the copy.
     pub contact_state: ContactState,
+    /// Work that the other tools have done on the copy since it was made, J: negative if they got more than they gave.
+    pub others_work_j: f64,
 }
 
-/// A copy of the tissue on the client's side that contains the client's tool and no other. [`crate::Renderer::tick`]
-/// calls it a thousand times a second, so it should neither block nor allocate.
+/// Another tool on the tissue, as far as the client knows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OtherTool {
+    /// Its number in the session.
+    pub tool: u32,
+    /// Its tip.
+    pub tip: Tip,
+    /// Its last known place and velocity, in the tissue's frame, at a time by the client's clock. It is taken to go on with
+    /// this velocity ([`MotionState::at`]).
+    pub motion: MotionState,
+}
+
+/// Returns the time by the client's clock, s, at which another tool was where a sample says: midway between the time at which
+/// the client's tool was at the place of the sample's local model, and the sample's arrival at `now_s`, as if the delay
+/// were the same both ways. A copy then has all tools where they are at one moment. If it had the others where the server
+/// will have them when the client's place arrives there, or had them as late as the samples are, the error is about twice
+/// as large (docs/link.md).
+pub fn midway_s(model_time_s: f64, now_s: f64) -> f64 {
+    0.5 * (model_time_s + now_s)
+}
+
+/// Largest number of other tools that a client follows.
+pub const MAX_OTHERS: usize = 32;
+
+/// A copy of the tissue on the client's side that contains the client's tool and the other tools that it knows.
+/// [`crate::Renderer::tick`] calls it a thousand times a second, so it should neither block nor allocate.
 pub trait Predictor: Send {
     /// Moves the tool to `place_m` (m, in the tissue's frame, finite) at `now_s` by the client's clock, s, which never
-    /// goes back. Returns the force and contact there; `None` if the copy has no answer, now or from now on: the local
-    /// model is then rendered.
-    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted>;
+    /// goes back, and the `others`, at most [`MAX_OTHERS`], to where they are then; those that are missing have let go.
+    /// Returns the force and contact of the tool; `None` if the copy has no answer, now or from now on: the local model is
+    /// then rendered.
+    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted>;
 }
 
 /// Forces computed in a tick, before the bias and the envelope.
@@ -96,6 +131,10 @@ pub struct Prediction {
     /// less.
     squared: [f64; 3],
     is_worse: bool,
+    /// The work of the other tools at the last answer, J.
+    others_work_j: f64,
+    /// Whether another tool moves by itself.
+    others_move: bool,
 }
 
 impl Prediction {
@@ -111,12 +150,19 @@ impl Prediction {
             compared_s: f64::NEG_INFINITY,
             squared: [0.0; 3],
             is_worse: false,
+            others_work_j: 0.0,
+            others_move: false,
         }
     }
 
-    /// Moves the tool in the copy.
-    pub(crate) fn move_to(&mut self, now_s: f64, place_m: DVec3) {
-        self.now = self.predictor.feel(now_s, place_m).filter(|felt| felt.force_n.is_finite());
+    /// Moves the tools in the copy. Returns the work that the others have done on it since the last answer, J. It counts
+    /// whatever is rendered: what another tool gives while the copy is not rendered, it may get back while it is.
+    pub(crate) fn move_to(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> f64 {
+        let is_sound = |felt: &Predicted| felt.force_n.is_finite() && felt.others_work_j.is_finite();
+        self.now = self.predictor.feel(now_s, place_m, others).filter(is_sound);
+        self.others_move = others.iter().any(|other| other.motion.velocity_m_per_s != DVec3::ZERO);
+        let Some(now) = self.now else { return 0.0 };
+        now.others_work_j - std::mem::replace(&mut self.others_work_j, now.others_work_j)
     }
 
     /// Stores the forecast for this tick.
@@ -142,7 +188,10 @@ impl Prediction {
         // There may be no later forecast.
         let then = next.map_or(*before, |next| before.towards(next, time_s));
         let truth_n = truth_n(then.place_m);
-        self.error_n = Some((truth_n - then.copy_n, then.copy_n.length()));
+        let (error_n, size_n) = (truth_n - then.copy_n, then.copy_n.length());
+        let kept = if self.others_move { ((self.compared_s - time_s).min(0.0) / MEMORY_S).exp() } else { 0.0 };
+        let (before_n, before_size_n) = self.error_n.unwrap_or((error_n, size_n));
+        self.error_n = Some((error_n.lerp(before_n, kept), size_n + kept * (before_size_n - size_n)));
         // A server that receives nothing sends samples of the same time again.
         if time_s <= self.compared_s {
             return;

@@ -24,10 +24,11 @@
 
 use glam::DVec3;
 
+use crate::dead_reckoning::MotionState;
 use crate::envelope::{Envelope, RenderingState, Wanted};
 use crate::force_law::Law;
 use crate::local_model::{ContactState, LocalModel, Touching, Track};
-use crate::prediction::Prediction;
+use crate::prediction::{MAX_OTHERS, OtherTool, Prediction};
 
 /// Time constant with which the bias (the difference of the force to that of the model before) decays, s.
 pub const BIAS_S: f64 = 0.02;
@@ -101,6 +102,8 @@ pub struct Renderer {
     velocity_m_per_s: DVec3,
     refused: u64,
     prediction: Option<Prediction>,
+    /// The other tools on the tissue, by ascending number.
+    others: Vec<OtherTool>,
     /// Number of ticks that were rendered from a copy of the tissue.
     predicted: u64,
     /// Whether the last tick was rendered from a copy, and its wanted force, N.
@@ -129,6 +132,7 @@ impl Renderer {
             velocity_m_per_s: DVec3::ZERO,
             refused: 0,
             prediction: None,
+            others: Vec::with_capacity(MAX_OTHERS),
             predicted: 0,
             last: (false, DVec3::ZERO),
             envelope,
@@ -140,6 +144,17 @@ impl Renderer {
     /// so drop it outside of ticks.
     pub fn predict(&mut self, prediction: Option<Prediction>) -> Option<Prediction> {
         std::mem::replace(&mut self.prediction, prediction)
+    }
+
+    /// Replaces what is known of the other tools on the tissue, for the copy of it; at first there are none. Beyond
+    /// [`MAX_OTHERS`] the last are left out. Those whose motion is not finite are left out too. Does not allocate.
+    pub fn follow_others(&mut self, others: &[OtherTool]) {
+        self.others.clear();
+        let is_finite = |other: &&OtherTool| {
+            let MotionState { time_s, place_m, velocity_m_per_s } = other.motion;
+            time_s.is_finite() && place_m.is_finite() && velocity_m_per_s.is_finite()
+        };
+        self.others.extend(others.iter().filter(is_finite).take(MAX_OTHERS));
     }
 
     /// Returns the number of ticks that were rendered from a copy of the tissue, since the renderer was created.
@@ -165,6 +180,7 @@ impl Renderer {
         self.laws.drain(..).for_each(|known| used(known.1));
         self.laws.push((0, law));
         (self.newest, self.arrived) = (None, None);
+        self.others.clear();
     }
 
     /// Adds a law under a number that models may name from now on. Returns true; or false, and changes nothing, if it
@@ -313,7 +329,10 @@ impl Renderer {
             if let Some((model, touching)) = &mut self.newest {
                 touching.move_to(model, law_of(&self.laws, model), place_m);
             }
-            self.prediction.iter_mut().for_each(|prediction| prediction.move_to(now_s, place_m));
+            let others = &self.others;
+            if let Some(prediction) = &mut self.prediction {
+                self.envelope.supply(prediction.move_to(now_s, place_m, others));
+            }
             if let Some((model, arrived_s)) = self.arrived.take() {
                 self.newest_s = Some(arrived_s);
                 self.adopt(model, now_s);
@@ -469,9 +488,13 @@ mod tests {
     struct Copy(f64);
 
     impl crate::Predictor for Copy {
-        fn feel(&mut self, _: f64, place_m: DVec3) -> Option<crate::Predicted> {
+        fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<crate::Predicted> {
             let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-            Some(crate::Predicted { force_n: -400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z, contact_state })
+            Some(crate::Predicted {
+                force_n: -400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z,
+                contact_state,
+                others_work_j: 0.0,
+            })
         }
     }
 

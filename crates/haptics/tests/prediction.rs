@@ -7,7 +7,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use glam::{DMat3, DVec3};
 use palpate_haptics::envelope::ENGAGE_S;
 use palpate_haptics::renderer::BIAS_S;
-use palpate_haptics::{ContactState, Device, Envelope, Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
+use palpate_haptics::{
+    ContactState, Device, Envelope, Law, LocalModel, OtherTool, Predicted, Prediction, Predictor, Renderer,
+};
 
 const TICK_S: f64 = 1e-3;
 /// Round trip, ticks.
@@ -27,9 +29,9 @@ struct Copy {
 }
 
 impl Predictor for Copy {
-    fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
+    fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-        let felt = Predicted { force_n: self.factor * force_n(place_m), contact_state };
+        let felt = Predicted { force_n: self.factor * force_n(place_m), contact_state, others_work_j: 0.0 };
         (!self.is_off.load(Ordering::Relaxed)).then_some(felt)
     }
 }

@@ -59,7 +59,7 @@ pub(super) enum Request {
     },
     /// A command or a change has arrived for a session at rest.
     Wake,
-    Samples(SampleTap),
+    Samples(Box<SampleTap>),
     Probe(ProbeTap),
     View(Arc<Viewer>),
     /// A copy of the session as it is.

@@ -362,6 +362,7 @@ impl SessionHandle {
             heartbeat_s: HEARTBEAT_S,
             laws,
             touch_stiffness,
+            other_tools: false,
             wanted: None,
         };
         Ok(self.tap(sampling, None, true).pop().await?.0)
@@ -371,7 +372,7 @@ impl SessionHandle {
         let (writer, reader) = queue(if once { 1 } else { self.limits.queued_samples });
         let sampler = Sampler::new(sampling, self.model.scene.stepping.rate_hz);
         let tap = SampleTap { sampler, once, writer, watcher: watcher.cloned(), overrun_count: 0 };
-        self.inbox.send(self.number, Request::Samples(tap));
+        self.inbox.send(self.number, Request::Samples(Box::new(tap)));
         reader
     }
 

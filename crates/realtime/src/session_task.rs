@@ -264,7 +264,7 @@ impl SessionTask {
                 if self.session.hold_reason().is_some() {
                     tap.writer.close(self.passed(0));
                 } else if self.running || !tap.once {
-                    self.subscribers.samples.push(tap);
+                    self.subscribers.samples.push(*tap);
                 }
             }
             Request::Save(reply) => _ = reply.send(self.present()),

@@ -20,8 +20,16 @@ use palpate_tissue::select::scheme_selection::NEVER;
 /// Opens a stream with a sample of each step.
 fn all_samples(handle: &SessionHandle) -> Reader<PacedSample> {
     let (laws, touch_stiffness) = (None, false);
-    let sampling =
-        Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness, wanted: None };
+    let sampling = Sampling {
+        every: 1,
+        only: None,
+        deadband: None,
+        heartbeat_s: 0.01,
+        laws,
+        touch_stiffness,
+        other_tools: false,
+        wanted: None,
+    };
     handle.samples(sampling, None)
 }
 

@@ -44,9 +44,9 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use command::Due;
-use palpate_haptics::LocalModel;
-use palpate_haptics::Tip;
 use palpate_haptics::pose_playback::{Path, Play};
+use palpate_haptics::prediction::MAX_OTHERS;
+use palpate_haptics::{LocalModel, MotionState, OtherTool, Tip};
 use palpate_tissue::memory;
 use palpate_tissue::scene::profile::{LoadProfile, MotionProfile, Poke};
 use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
@@ -143,6 +143,8 @@ pub struct Sample {
     /// Samples of the tools: those that ever had a control point by ascending number, or the requested ones in the
     /// order of the request.
     pub tools: Vec<ToolSample>,
+    /// Other tools ([`Session::other_tools`]), if a [`Sampler`](sample_selection::Sampler) was to add them.
+    pub other_tools: Vec<OtherTool>,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -652,7 +654,22 @@ impl Session {
             recoveries: self.recoveries.count(),
             recovered: self.recoveries.newest(),
             tools,
+            other_tools: Vec::new(),
         }
+    }
+
+    /// Returns the tools that are led by poses and are not in `own`, by ascending number, at most [`MAX_OTHERS`]. The time of
+    /// their motion is the simulated time.
+    pub fn other_tools(&self, own: &[u32]) -> Vec<OtherTool> {
+        let of = |(number, tool): (usize, &Tool)| {
+            let (tip, felt) = (tool.posed.as_ref()?.tip, self.tissue.tool_contact(number)?);
+            let (place_m, velocity_m_per_s) = (felt.place_m, felt.velocity_m_per_s);
+            #[allow(clippy::cast_possible_truncation)]
+            let tool = number as u32;
+            let motion = MotionState { time_s: self.time_s(), place_m, velocity_m_per_s };
+            (!own.contains(&tool)).then_some(OtherTool { tool, tip, motion })
+        };
+        self.tools.iter().enumerate().filter_map(of).take(MAX_OTHERS).collect()
     }
 
     /// Returns a copy of the present tissue that another thread can read, for example with [`record_of`]. It copies

@@ -132,6 +132,8 @@ pub struct Sampling {
     /// Whether stiffness and damping are also computed from the tissue around the tool under a touch, and not only
     /// under a grasp. Without `laws` it has no effect.
     pub touch_stiffness: bool,
+    /// Whether samples contain the tools that are not in `only` and are led by poses.
+    pub other_tools: bool,
     /// Shorter heartbeat that the reader may request at any time; the shorter of the two applies. `None`: only
     /// `heartbeat_s` applies.
     pub wanted: Option<Arc<WantedHeartbeat>>,
@@ -223,6 +225,9 @@ impl Sampler {
             Some(only) => session.sample(Some(only)),
             None => all.get_or_insert_with(|| session.sample(None)).clone(),
         };
+        if let (true, Some(only)) = (self.sampling.other_tools, &self.sampling.only) {
+            sample.other_tools = session.other_tools(only);
+        }
         let is_due = |told: &Sample| {
             last || step.saturating_sub(told.step) >= self.heartbeat_steps() || self.is_news(told, &sample)
         };
@@ -340,6 +345,7 @@ mod tests {
             heartbeat_s: HEARTBEAT_S,
             laws: None,
             touch_stiffness: false,
+            other_tools: false,
             wanted: None,
         }
     }

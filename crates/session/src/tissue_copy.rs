@@ -4,7 +4,8 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate_haptics::{ContactState, Predicted, Predictor, Tip};
+use palpate_haptics::prediction::MAX_OTHERS;
+use palpate_haptics::{ContactState, OtherTool, Predicted, Predictor, Tip};
 
 use super::Session;
 use super::command::{Command, Due};
@@ -12,8 +13,9 @@ use palpate_refusal::{Result, legible, number};
 use palpate_tissue::Model;
 use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::scene::script::Action;
+use palpate_tissue::shape::RestShape;
 
-/// Number of the copy's only tool.
+/// Number of the client's tool in the copy. Other tools have the following ones.
 const TOOL: u32 = 0;
 
 /// Limit of a client copy's work in a millisecond, in awake points times substeps: this takes up to 1 ms with a tip
@@ -29,11 +31,33 @@ const TICK_S: f64 = 1e-3;
 /// Time behind the client's above which a copy skips to the present, s: the client has paused.
 const MAX_BEHIND_S: f64 = 0.005;
 
-/// A copy of a tissue with one tool, which predicts the force on the tool between a server's samples. It begins at
-/// rest, and knows nothing of other tools.
+/// Another tool on a copy.
+#[derive(Debug, Clone, Copy)]
+struct LedTool {
+    /// Its number in the server's session.
+    tool: u32,
+    tip: Tip,
+    /// Its place, m, and the force on it, N, after the last step that it did.
+    before: Option<(DVec3, DVec3)>,
+}
+
+impl LedTool {
+    /// Returns whether a tool is led with the same tip: shape and radius can't change until it is released.
+    fn is(&self, other: &OtherTool) -> bool {
+        let of = |tip: &Tip| (tip.shape, tip.radius_m, tip.grasps);
+        self.tool == other.tool && of(&self.tip) == of(&other.tip)
+    }
+}
+
+/// A copy of a tissue with a client's tool, which predicts the force on the tool between a server's samples. It begins at
+/// rest. Of the other tools it knows those that are led by poses, as far as the client does.
 pub struct TissueCopy {
     session: Session,
     tip: Tip,
+    /// The other tools on the copy.
+    others: [Option<LedTool>; MAX_OTHERS],
+    /// Work that they have done on it, J.
+    others_work_j: f64,
     due: Vec<Due>,
     /// The client's time minus the copy's, s; `None` before the first tick.
     ahead_s: Option<f64>,
@@ -45,8 +69,16 @@ pub struct TissueCopy {
 impl TissueCopy {
     /// Creates a copy at rest, for a tool with this tip, without a limit of its work and without a check of the tip.
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
-        let (session, due) = (Session::new(model), Vec::with_capacity(1));
-        TissueCopy { session, tip, due, ahead_s: None, place_m: DVec3::ZERO, most_point_substeps: u64::MAX }
+        TissueCopy {
+            session: Session::new(model),
+            tip,
+            others: [None; MAX_OTHERS],
+            others_work_j: 0.0,
+            due: Vec::with_capacity(1 + 2 * MAX_OTHERS),
+            ahead_s: None,
+            place_m: DVec3::ZERO,
+            most_point_substeps: u64::MAX,
+        }
     }
 
     /// Returns this copy with a limit of awake points times substeps per millisecond. While more points are awake
@@ -64,15 +96,15 @@ impl TissueCopy {
     pub fn for_client(model: &Arc<Model>, tip: Tip) -> Result<Self> {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;
-        let most_m = MAX_EDGES * shape.edge_m();
+        let most_m = most_radius_m(shape);
         let range = format!("at most {} for a copy of this tissue, {MAX_EDGES} lengths of an edge", legible(most_m));
         number("tip.radius_m", tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
         Ok(TissueCopy::new(model, tip).within(TICK_POINT_SUBSTEPS))
     }
 
-    /// Steps until `now_s`, with the tool on a straight path to `place_m`. The number of steps is rounded, so that
-    /// ticks that are a little early or late have one step each. `None` if too many points are awake.
-    fn step_to(&mut self, now_s: f64, place_m: DVec3) -> Option<()> {
+    /// Steps until `now_s`, with the tool on a straight path to `place_m`, and the others on theirs. The number of steps is
+    /// rounded, so that ticks that are a little early or late have one step each. `None` if too many points are awake.
+    fn step_to(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<()> {
         let step_s = self.session.model().scene.stepping.rate_hz.recip();
         let time_s = self.session.time_s();
         let behind_s = self.ahead_s.map(|ahead_s| now_s - ahead_s - time_s);
@@ -88,14 +120,48 @@ impl TissueCopy {
                 return None;
             }
             let on_way_m = self.place_m.lerp(place_m, f64::from(step) / f64::from(steps));
-            let action = Action::Pose { place_m: on_way_m, velocity_m_per_s: None, tip: self.tip };
-            self.due.push(Due::in_time(Command::new(TOOL, None, action)));
+            self.due.push(led(TOOL, on_way_m, self.tip));
+            self.lead_others(now_s - f64::from(steps - step) * step_s, others);
             self.session.advance(&mut self.due, |_| {});
+            self.count_work();
         }
         if steps > 0 {
             self.place_m = place_m;
         }
         Some(())
+    }
+
+    /// Leads the other tools to where they are at a time of the client, and releases those that are no longer known.
+    fn lead_others(&mut self, time_s: f64, others: &[OtherTool]) {
+        let most_m = most_radius_m(self.session.model().shape());
+        let known = || others.iter().filter(|other| other.tip.radius_m <= most_m);
+        for (slot, led_tool) in self.others.iter_mut().enumerate() {
+            if led_tool.is_some_and(|led_tool| !known().any(|other| led_tool.is(other))) {
+                *led_tool = None;
+                self.due.push(Due::in_time(Command::new(tool_at(slot), None, Action::Release)));
+            }
+        }
+        for other in known() {
+            let has = |led_tool: &Option<LedTool>| led_tool.is_some_and(|led_tool| led_tool.tool == other.tool);
+            let slot = self.others.iter().position(has).or_else(|| self.others.iter().position(Option::is_none));
+            let Some(slot) = slot else { continue };
+            let before = self.others[slot].and_then(|led_tool| led_tool.before);
+            self.others[slot] = Some(LedTool { tool: other.tool, tip: other.tip, before });
+            self.due.push(led(tool_at(slot), other.motion.at(time_s), other.tip));
+        }
+    }
+
+    /// Adds the work that the other tools did in the last step: the mean of the forces before and after it times the way.
+    fn count_work(&mut self) {
+        for (slot, led_tool) in self.others.iter_mut().enumerate() {
+            let Some(led_tool) = led_tool else { continue };
+            let felt = self.session.tissue().tool_contact(tool_at(slot) as usize);
+            let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
+            if let (Some((from_m, from_n)), Some((to_m, to_n))) = (led_tool.before, now) {
+                self.others_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
+            }
+            led_tool.before = now;
+        }
     }
 
     /// Returns whether a tick's steps take more than their limit.
@@ -106,15 +172,33 @@ impl TissueCopy {
     }
 }
 
+/// Returns the number of another tool in the copy.
+#[allow(clippy::cast_possible_truncation)]
+fn tool_at(slot: usize) -> u32 {
+    TOOL + 1 + slot as u32
+}
+
+/// Returns the largest radius of a tip on a copy, m.
+fn most_radius_m(shape: &dyn RestShape) -> f64 {
+    MAX_EDGES * shape.edge_m()
+}
+
+/// Returns the command that leads a tool to a place within the next step.
+fn led(tool: u32, place_m: DVec3, tip: Tip) -> Due {
+    Due::in_time(Command::new(tool, None, Action::Pose { place_m, velocity_m_per_s: None, tip }))
+}
+
 impl Predictor for TissueCopy {
-    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
+    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted> {
         if self.session.hold_reason().is_some() {
             return None;
         }
-        self.step_to(now_s, place_m)?;
+        self.step_to(now_s, place_m, others)?;
         let felt = self.session.tissue().tool_contact(TOOL as usize);
-        let free = Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free };
-        Some(felt.map_or(free, |feel| Predicted { force_n: feel.force_on_tool_n, contact_state: feel.contact_state }))
+        let others_work_j = self.others_work_j;
+        let (force_n, contact_state) =
+            felt.map_or((DVec3::ZERO, ContactState::Free), |feel| (feel.force_on_tool_n, feel.contact_state));
+        Some(Predicted { force_n, contact_state, others_work_j })
     }
 }
 
@@ -130,6 +214,7 @@ impl std::fmt::Debug for TissueCopy {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use palpate_haptics::MotionState;
 
     /// Returns the place at a tick of a press of 3 mm and a stroke.
     fn place_m(tick: u32) -> DVec3 {
@@ -166,9 +251,44 @@ mod tests {
         let mut copy = TissueCopy::new(&model, Tip::default());
         for (tick, truth_n) in (0..300).zip(truth_n) {
             let early_s = [0.0, -3e-4, 4e-4, 1e-4][tick as usize % 4];
-            let felt = copy.feel(17.0 + f64::from(tick) * TICK_S + early_s, place_m(tick)).unwrap();
+            let felt = copy.feel(17.0 + f64::from(tick) * TICK_S + early_s, place_m(tick), &[]).unwrap();
             assert_eq!(felt.force_n, truth_n, "{tick}");
         }
+    }
+
+    /// Another tool that presses 15 mm beside the first, from a tick on until another one.
+    fn other(tick: u32) -> Option<OtherTool> {
+        let time_s = f64::from(tick) * TICK_S;
+        let place_m = place_m(tick) + DVec3::new(0.015, 0.0, -0.001);
+        let motion = MotionState { time_s, place_m, velocity_m_per_s: DVec3::ZERO };
+        (50..250).contains(&tick).then_some(OtherTool { tool: 7, tip: Tip::default(), motion })
+    }
+
+    #[test]
+    fn a_copy_feels_the_other_tools_as_a_session_does_and_counts_their_work() {
+        let model = model();
+        let (mut session, mut copy) = (Session::new(&model), TissueCopy::new(&model, Tip::default()));
+        let (mut most_j, mut alone) = (0.0_f64, TissueCopy::new(&model, Tip::default()));
+        let mut apart_n = 0.0_f64;
+        for tick in 0..400 {
+            let mut due = vec![led(0, place_m(tick), Tip::default())];
+            match (other(tick), tick) {
+                (Some(other), _) => due.push(led(1, other.motion.place_m, other.tip)),
+                (None, 250) => due.push(Due::in_time(Command::new(1, None, Action::Release))),
+                (None, _) => {}
+            }
+            session.advance(&mut due, |_| {});
+            let truth_n = session.tissue().tool_contact(0).map_or(DVec3::ZERO, |feel| feel.force_on_tool_n);
+            let others: Vec<_> = other(tick).into_iter().collect();
+            let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick), &others).unwrap();
+            assert_eq!(felt.force_n, truth_n, "{tick}");
+            most_j = most_j.max(felt.others_work_j);
+            let alone_n = alone.feel(f64::from(tick) * TICK_S, place_m(tick), &[]).unwrap().force_n;
+            apart_n = apart_n.max(alone_n.distance(truth_n));
+        }
+        // The other tool matters, and gives the tissue the work of a press of some millimetres.
+        assert!(apart_n > 1e-3, "{apart_n} N");
+        assert!((1e-6..1e-2).contains(&most_j), "{most_j} J");
     }
 
     #[test]
@@ -177,7 +297,7 @@ mod tests {
         let mut copy = TissueCopy::new(&model, Tip::default());
         let steps = |copy: &TissueCopy| copy.session.step_count();
         for (tick, expected) in [(0, 1), (1, 2), (5, 6), (15, 7), (15, 7), (16, 8), (5000, 9), (5001, 10)] {
-            let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick.min(200))).unwrap();
+            let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick.min(200)), &[]).unwrap();
             assert!(felt.force_n.is_finite() && steps(&copy) == expected, "{tick}: {} steps", steps(&copy));
         }
     }
@@ -194,7 +314,7 @@ mod tests {
             .unwrap();
             let mut copy = TissueCopy::new(&model, Tip::default());
             for tick in 0..2000 {
-                let felt = copy.feel(3.0 + f64::from(tick) * TICK_S, DVec3::new(0.1, 0.1, 0.01)).unwrap();
+                let felt = copy.feel(3.0 + f64::from(tick) * TICK_S, DVec3::new(0.1, 0.1, 0.01), &[]).unwrap();
                 assert!(felt.force_n.is_finite());
             }
             let apart_s = (copy.session.time_s() - 2.0).abs();
@@ -206,7 +326,7 @@ mod tests {
     fn a_copy_with_too_much_to_compute_tells_nothing() {
         let model = model();
         let mut copy = TissueCopy::new(&model, Tip::default()).within(50);
-        let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, place_m(tick))).collect();
+        let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, place_m(tick), &[])).collect();
         // Nothing is computed at rest.
         assert!(felt[0].is_some() && felt[199].is_none());
     }

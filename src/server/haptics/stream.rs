@@ -120,6 +120,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
         return Err(Refusal::new(Reason::Missing, "device", message).into());
     }
     sampling.touch_stiffness = open.touch_stiffness;
+    sampling.other_tools = open.other_tools;
     let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
     let guard = handle.open_stream("Touch", kind, account)?;
     let begun = match device {

@@ -62,6 +62,38 @@ async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
     assert!(stiffness.z_axis.z > 70.0 && (stiffness - stiffness.transpose()).abs().x_axis.y < 1e-9);
 }
 
+/// One stream sees the tool of another: where it is, how fast, and with what tip. A stream that does not ask sees none.
+#[tokio::test]
+async fn a_stream_may_see_the_tools_of_others() {
+    let server = TestServer::start(&[]);
+    let session = liver(&server).await;
+    let mut seen = TestTouch::open(&server, pb::TouchOpen { other_tools: true, ..open(&session, &[0]) }).await.unwrap();
+    let mut mover =
+        TestTouch::open(&server, pb::TouchOpen { other_tools: true, ..open(&session, &[3, 5]) }).await.unwrap();
+    let mut blind = TestTouch::open(&server, open(&session, &[1])).await.unwrap();
+    let tip = pb::Tip { radius_m: 0.007, friction: Some(0.4), ..Default::default() };
+    for k in 0..200_u64 {
+        let mut command = pose(k + 1, 1000 + k, 0.002 - 2e-5 * (k.min(150)) as f64);
+        command.tool = 3;
+        if let Some(pb::command::Action::Pose(pose)) = &mut command.action {
+            pose.tip = Some(tip);
+        }
+        mover.command(command).await;
+    }
+    let lowered = |sample: &pb::Sample| {
+        sample.other_tools.first().is_some_and(|other| other.position_m.is_some_and(|place_m| place_m.z < 0.0))
+    };
+    let sample = seen.sample_with(lowered).await;
+    let [other] = &sample.other_tools[..] else { panic!("{sample:?}") };
+    assert_eq!((other.tool, other.tip), (3, Some(tip)));
+    let velocity_m_per_s = other.velocity_m_per_s.unwrap();
+    assert!((-0.5..=0.0).contains(&velocity_m_per_s.z), "{velocity_m_per_s:?}");
+    assert!(sample.tools.iter().all(|tool| tool.tool == 0));
+    // Its own tools are none of the others.
+    assert_eq!(mover.sample_with(|sample| sample.step > 0).await.other_tools, []);
+    assert_eq!(blind.sample_with(|sample| sample.step > 0).await.other_tools, []);
+}
+
 #[tokio::test]
 async fn without_poses_the_tool_is_held_and_then_lets_go() {
     let server = TestServer::start(&[]);

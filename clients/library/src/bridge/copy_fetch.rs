@@ -51,6 +51,11 @@ impl Copying {
         Copying { channel, session_id: session.session_id.clone(), tip, copier, under_way: JoinSet::new() }
     }
 
+    /// Returns whether this tissue is copied.
+    pub(super) fn is_wanted(&self) -> bool {
+        self.copier.is_some()
+    }
+
     /// Starts building a copy of the current tissue. Aborts an earlier one that is not finished.
     pub(super) fn begin(&mut self) {
         self.under_way.abort_all();

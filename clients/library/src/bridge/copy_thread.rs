@@ -8,7 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_haptics::{Predicted, Predictor};
+use palpate_haptics::prediction::MAX_OTHERS;
+use palpate_haptics::{OtherTool, Predicted, Predictor};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 
 use crate::exchange::{NewestReader, NewestWriter, newest};
@@ -24,11 +25,12 @@ const ROUND: Duration = Duration::from_micros(200);
 const PATIENT_ROUNDS: u32 = 5000;
 const LONG_ROUND: Duration = Duration::from_millis(5);
 
-/// The place of the tool at a time.
+/// The place of the tool at a time, and the other tools.
 #[derive(Clone, Copy)]
 struct ToolPlace {
     now_s: f64,
     place_m: DVec3,
+    others: [Option<OtherTool>; MAX_OTHERS],
 }
 
 /// What the tool felt at a place.
@@ -47,10 +49,14 @@ struct Stepped {
 }
 
 impl Predictor for Stepped {
-    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
+    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted> {
         self.felt.refresh();
         let Felt { now_s: then_s, felt } = *self.felt.read();
-        self.places.write(|place| *place = ToolPlace { now_s, place_m });
+        self.places.write(|place| {
+            (place.now_s, place.place_m) = (now_s, place_m);
+            let others = others.iter().copied().map(Some).chain(std::iter::repeat(None));
+            place.others.iter_mut().zip(others).for_each(|(place, other)| *place = other);
+        });
         felt.filter(|_| now_s - then_s <= MAX_LATE_S)
     }
 }
@@ -64,6 +70,8 @@ impl Drop for Stepped {
 /// The end of the stepping thread.
 struct Stepper {
     places: NewestReader<ToolPlace>,
+    /// The other tools at the newest place.
+    others: Vec<OtherTool>,
     felt: NewestWriter<Felt>,
     is_over: Arc<AtomicBool>,
 }
@@ -74,8 +82,11 @@ impl Stepper {
         if !self.places.refresh() {
             return false;
         }
-        let ToolPlace { now_s, place_m } = *self.places.read();
-        let felt = copy.feel(now_s, place_m);
+        let ToolPlace { now_s, place_m, others } = self.places.read();
+        self.others.clear();
+        self.others.extend(others.iter().map_while(|other| *other));
+        let now_s = *now_s;
+        let felt = copy.feel(now_s, *place_m, &self.others);
         self.felt.write(|newest| *newest = Felt { now_s, felt });
         true
     }
@@ -100,10 +111,12 @@ impl Stepper {
 
 /// Creates the two ends of a copy.
 fn ends() -> (Stepped, Stepper) {
-    let (places, to_step) = newest(&ToolPlace { now_s: 0.0, place_m: DVec3::ZERO });
+    let (places, to_step) = newest(&ToolPlace { now_s: 0.0, place_m: DVec3::ZERO, others: [None; MAX_OTHERS] });
     let (told, felt) = newest(&Felt { now_s: f64::NEG_INFINITY, felt: None });
     let is_over = Arc::new(AtomicBool::new(false));
-    (Stepped { places, felt, is_over: is_over.clone() }, Stepper { places: to_step, felt: told, is_over })
+    let stepper =
+        Stepper { places: to_step, others: Vec::with_capacity(MAX_OTHERS), felt: told, is_over: is_over.clone() };
+    (Stepped { places, felt, is_over }, stepper)
 }
 
 /// Runs `make` on the thread that will step its result, and returns the future result. Drops `permit` when that
@@ -140,14 +153,14 @@ mod tests {
     use super::*;
 
     fn pressed(place_m: DVec3) -> Predicted {
-        Predicted { force_n: -400.0 * place_m, contact_state: ContactState::Sticking }
+        Predicted { force_n: -400.0 * place_m, contact_state: ContactState::Sticking, others_work_j: 0.0 }
     }
 
     /// A spring.
     struct CopySpring;
 
     impl Predictor for CopySpring {
-        fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
+        fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
             Some(pressed(place_m))
         }
     }
@@ -157,17 +170,17 @@ mod tests {
         let (mut stepped, mut stepper) = ends();
         let place_m = |tick: u32| DVec3::new(0.0, 0.0, -1e-4 * f64::from(tick));
         for tick in 0..50 {
-            let felt = stepped.feel(f64::from(tick) * 1e-3, place_m(tick));
+            let felt = stepped.feel(f64::from(tick) * 1e-3, place_m(tick), &[]);
             assert_eq!(felt, tick.checked_sub(1).map(|last| pressed(place_m(last))));
             assert!(stepper.step(&mut CopySpring) && !stepper.step(&mut CopySpring));
         }
         // The thread is in a step that does not end.
         let felt: Vec<bool> =
-            (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, place_m(tick)).is_some()).collect();
+            (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, place_m(tick), &[]).is_some()).collect();
         assert_eq!(felt, [true, true, true, true, false, false, false, false, false, false]);
         // It continues with the newest place.
         assert!(stepper.step(&mut CopySpring));
-        assert_eq!(stepped.feel(0.060, place_m(60)), Some(pressed(place_m(59))));
+        assert_eq!(stepped.feel(0.060, place_m(60), &[]), Some(pressed(place_m(59))));
         drop(stepped);
         assert!(stepper.is_over());
     }
@@ -176,7 +189,7 @@ mod tests {
     struct Endless(mpsc::Receiver<()>);
 
     impl Predictor for Endless {
-        fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
+        fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
             let _ = self.0.recv();
             Some(pressed(place_m))
         }
@@ -192,7 +205,7 @@ mod tests {
             let made = made_apart(move || Ok(Box::new(Endless(ended))), permit).unwrap();
             let mut copy = made.await.unwrap().unwrap();
             // This thread gets past although no step ends.
-            assert!((0..1000).all(|tick| copy.feel(f64::from(tick) * 1e-3, DVec3::ZERO).is_none()));
+            assert!((0..1000).all(|tick| copy.feel(f64::from(tick) * 1e-3, DVec3::ZERO, &[]).is_none()));
             drop(copy);
             drop(end);
             // Once the step has ended, another copy can be built.

@@ -310,6 +310,7 @@ async fn connect(
         lease_s: Some(SILENCE.as_secs_f64()),
         datagrams: target.datagrams,
         lease_id: trail.lease_id.clone(),
+        other_tools: copying.is_wanted(),
         ..Default::default()
     };
     let silent = |_| broken("the server is silent");

@@ -7,8 +7,11 @@
 use glam::DVec3;
 use palpate_haptics::dead_reckoning::News;
 use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::prediction::{MAX_OTHERS, midway_s};
 use palpate_haptics::renderer::MAX_LAWS;
-use palpate_haptics::{Device, Envelope, Law, LocalModel, Prediction, Predictor, Renderer, RenderingState};
+use palpate_haptics::{
+    Device, Envelope, Law, LocalModel, MotionState, OtherTool, Prediction, Predictor, Renderer, RenderingState,
+};
 use palpate_proto::{pb, touch};
 use std::collections::VecDeque;
 
@@ -50,6 +53,8 @@ enum Used {
 struct Newest {
     connection: u64,
     model: Option<LocalModel>,
+    /// The other tools at the time of the model, and their number.
+    others: [Option<OtherTool>; MAX_OTHERS],
     /// The longest time between two poses that the server wants, s; 0 before it has sent one.
     wanted_s: f64,
 }
@@ -96,6 +101,8 @@ pub struct Ticker {
     news: News,
     clock: Clock,
     place_m: DVec3,
+    /// The other tools of the newest model; kept so that a tick allocates nothing.
+    others: Vec<OtherTool>,
 }
 
 /// The network's half of a bridge: passes laws, models and copies to the ticks.
@@ -107,6 +114,7 @@ pub(super) struct LoopFeed {
     /// Events that did not fit into the queue yet.
     waiting: VecDeque<LoopEvent>,
     model: Option<LocalModel>,
+    others: [Option<OtherTool>; MAX_OTHERS],
     wanted_s: f64,
 }
 
@@ -119,7 +127,8 @@ pub(super) fn ticker(
     let (to_learn, told) = queue(LAWS);
     let (used, back) = queue(USED);
     let (commands, received) = queue(COMMANDS);
-    let (newest_writer, newest_reader) = newest(&Newest { connection: 0, model: None, wanted_s: 0.0 });
+    let (newest_writer, newest_reader) =
+        newest(&Newest { connection: 0, model: None, others: [None; MAX_OTHERS], wanted_s: 0.0 });
     let ticker = Ticker {
         told,
         newest: newest_reader,
@@ -138,6 +147,7 @@ pub(super) fn ticker(
         news: News::default(),
         clock: Clock::default(),
         place_m: DVec3::ZERO,
+        others: Vec::with_capacity(MAX_OTHERS),
     };
     let feed = LoopFeed {
         told: to_learn,
@@ -146,6 +156,7 @@ pub(super) fn ticker(
         connection: 0,
         waiting: VecDeque::new(),
         model: None,
+        others: [None; MAX_OTHERS],
         wanted_s: 0.0,
     };
     (ticker, feed, received)
@@ -206,10 +217,19 @@ impl Ticker {
             renderer.envelope.reset();
             renderer.envelope.enable();
         }
-        let Newest { connection, model, wanted_s } = *self.newest.read();
+        let Newest { connection, model, others, wanted_s } = self.newest.read();
+        let (connection, wanted_s) = (*connection, *wanted_s);
         if self.is_fresh && connection == self.connection {
             self.is_fresh = false;
-            model.into_iter().for_each(|model| renderer.receive(model, now_s));
+            if let Some(model) = model {
+                let time_s = midway_s(model.client_time_s, now_s);
+                let known = others.iter().map_while(|other| *other);
+                self.others.clear();
+                self.others
+                    .extend(known.map(|other| OtherTool { motion: MotionState { time_s, ..other.motion }, ..other }));
+                renderer.follow_others(&self.others);
+                renderer.receive(*model, now_s);
+            }
         }
         let force_n = renderer.tick(now_s, place_m);
         if !(place_m.is_finite() && now_s.is_finite()) {
@@ -365,13 +385,16 @@ impl LoopFeed {
         self.pass_on();
     }
 
-    /// Takes the local model of the tool from a sample, and the interval at which the server wants poses, s.
+    /// Takes the local model of the tool and the other tools from a sample, and the interval at which the server wants poses, s.
     pub(super) fn receive(&mut self, sample: &pb::Sample, wanted_s: f64) {
         self.wanted_s = wanted_s;
         if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
             let model = touch::from_local_model(model, sample.step);
             if self.model.is_none_or(|newest| newest.sequence < model.sequence) {
                 self.model = Some(model);
+                let others = sample.other_tools.iter().map(|other| touch::from_other_tool(other, model.client_time_s));
+                self.others = [None; MAX_OTHERS];
+                self.others.iter_mut().zip(others.flatten()).for_each(|(place, other)| *place = Some(other));
             }
         }
         self.pass_on();
@@ -386,7 +409,8 @@ impl LoopFeed {
                 return;
             }
         }
-        let newest = Newest { connection: self.connection, model: self.model, wanted_s: self.wanted_s };
+        let Self { connection, model, others, wanted_s, .. } = *self;
+        let newest = Newest { connection, model, others, wanted_s };
         self.newest.write(|place| *place = newest);
     }
 }

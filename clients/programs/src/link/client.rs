@@ -4,12 +4,13 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_haptics::envelope::{Envelope, Wanted};
-use palpate_haptics::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
+use palpate_haptics::{Law, LocalModel, MotionState, OtherTool, Predicted, Prediction, Predictor, Renderer, Tip};
 use palpate_session::tissue_copy::TissueCopy;
 use palpate_tissue::Model;
 
 use super::setup::{Rendering, Setup, TICK_S};
 use super::spot::Spot;
+use super::tissue::SECOND_TOOL;
 
 /// The client at the device, by scheme.
 pub(super) enum LinkClient {
@@ -22,11 +23,20 @@ pub(super) enum LinkClient {
 struct Copied {
     tissue: TissueCopy,
     spot: Spot,
+    /// The other tools in the tissue's frame; kept so that a tick allocates nothing.
+    others: Vec<OtherTool>,
 }
 
 impl Predictor for Copied {
-    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
-        let felt = self.tissue.feel(now_s, self.spot.of_tissue(place_m))?;
+    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted> {
+        self.others.clear();
+        self.others.extend(others.iter().map(|other| {
+            let MotionState { time_s, place_m, velocity_m_per_s } = other.motion;
+            let (place_m, velocity_m_per_s) =
+                (self.spot.of_tissue(place_m), self.spot.direction_of_tissue(velocity_m_per_s));
+            OtherTool { motion: MotionState { time_s, place_m, velocity_m_per_s }, ..*other }
+        }));
+        let felt = self.tissue.feel(now_s, self.spot.of_tissue(place_m), &self.others)?;
         Some(Predicted { force_n: self.spot.direction(felt.force_n), ..felt })
     }
 }
@@ -53,7 +63,8 @@ impl LinkClient {
     /// Sets the copy of a tissue, if the client renders from one.
     pub(super) fn copy(&mut self, setup: &Setup, model: &Arc<Model>) {
         if let (LinkClient::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
-            let copied = Copied { tissue: TissueCopy::new(model, setup.tip), spot: setup.spot };
+            let copied =
+                Copied { tissue: TissueCopy::new(model, setup.tip), spot: setup.spot, others: Vec::with_capacity(1) };
             renderer.predict(Some(Prediction::new(Box::new(copied))));
         }
     }
@@ -62,6 +73,13 @@ impl LinkClient {
     pub(super) fn learn(&mut self, number: u32, law: &Law) {
         if let LinkClient::Model(renderer) = self {
             renderer.learn(number, law.clone());
+        }
+    }
+
+    /// Takes the newest motion of the second tool, in the hand's frame.
+    pub(super) fn follow(&mut self, tip: Tip, motion: MotionState) {
+        if let LinkClient::Model(renderer) = self {
+            renderer.follow_others(&[OtherTool { tool: SECOND_TOOL, tip, motion }]);
         }
     }
 

@@ -118,7 +118,8 @@ pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -
         rows.insert(2, ("deadband", table::percent(setup.deadband)));
     }
     if setup.second_m > 0.0 {
-        rows.insert(2, ("second tool", format!("{} away", table::with_unit(setup.second_m, "m"))));
+        let (away, hand) = (table::with_unit(setup.second_m, "m"), setup.second_hand.name());
+        rows.insert(2, ("second tool", format!("{away} away, {hand} hand")));
     }
     if let Some(change) = &setup.change {
         let [at_s, factor] = [change.at_s, change.factor].map(table::rounded);
@@ -175,6 +176,7 @@ fn asked(setup: &Setup) -> Value {
         "seconds": setup.duration_s,
         "seed": setup.seed,
         "second_tool_mm": 1e3 * setup.second_m,
+        "second_hand": setup.second_hand.name(),
         "tissue_change_s": setup.change.as_ref().map(|change| change.at_s),
         "tissue_change_factor": setup.change.as_ref().map(|change| change.factor),
         "place_m": setup.spot.at_m.to_array(),

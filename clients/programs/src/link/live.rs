@@ -88,7 +88,7 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<LinkOutcome, Cl
             let CoursePart { time_s: now_s, place_m, force_n } = part;
             // The hand's place is relative to the spot.
             let (true_n, touches) = twin.truth(place_m + spot.at_m, f64::from(tick) * TICK_S)?;
-            totals.moved(place_m);
+            totals.moved(place_m, 0.0);
             let (depth_m, direct_m) = (-place_m.z, direct.depth_m(tick + 1));
             totals.rendered(&LinkTick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s: None }, None);
         }

@@ -39,7 +39,7 @@ use crate::table;
 use figures::{figures, rows};
 use laws::PlaceLaws;
 use run::run;
-use setup::{Rendering, Setup, TissueChange};
+use setup::{Rendering, SecondHand, Setup, TissueChange};
 use spot::Spot;
 
 /// Arguments of `link`.
@@ -82,6 +82,9 @@ pub(crate) struct LinkArguments {
     /// A second tool with its own seed presses at this distance from the place of the task, mm
     #[arg(long, value_name = "MM", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
     second_tool_mm: f64,
+    /// With --second-tool-mm: who leads the second tool
+    #[arg(long, value_name = "WHOSE", default_value = "another", requires = "second_tool_mm")]
+    second_hand: SecondHand,
     /// The tissue changes at this time, s
     #[arg(long, value_name = "SECONDS", conflicts_with_all = ["random", "boundary"])]
     tissue_change_s: Option<f64>,
@@ -298,6 +301,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
         deadband,
         up_deadband,
         second_m,
+        second_hand: arguments.second_hand,
         change,
         duration_s,
         seed,

@@ -1,9 +1,10 @@
 //! One run in virtual time, tick by tick: hand, device, network, tissue, and the tissue's twin without a network.
 
 use glam::DVec3;
-use palpate_haptics::RenderingState;
 use palpate_haptics::envelope::Envelope;
 use palpate_haptics::hand::HandState;
+use palpate_haptics::prediction::midway_s;
+use palpate_haptics::{MotionState, RenderingState};
 use palpate_proto::touch::sample_bytes;
 use palpate_simulated::network::{Conditions, Direction, Outages, Stalls, Transport};
 use palpate_simulated::random::Random;
@@ -13,9 +14,9 @@ use super::client::LinkClient;
 use super::direct::Direct;
 use super::measure::{LinkOutcome, LinkTick, Totals};
 use super::poses::{Down, Poses, Up};
-use super::server::{LinkServer, Other};
-use super::setup::{Setup, TICK_S, ticks};
-use super::tissue::LinkTissue;
+use super::server::{LinkServer, Other, Told};
+use super::setup::{SecondHand, Setup, TICK_S, ticks};
+use super::tissue::{LinkTissue, Second};
 
 /// Distance of the tool, in amplitudes of the task, beyond which a run is also unstable.
 const UNSTABLE_AMPLITUDES: f64 = 3.0;
@@ -60,20 +61,22 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
     let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
     let mut totals = Totals::with(Outages::new(conditions, *seed, task::LEAD_S));
     totals.outcome.scale = direct.scale;
+    let own = Second::of(setup).filter(|_| setup.second_hand == SecondHand::Own);
     let mut paused_s: Option<f64> = None;
     let mut stalls = Stalls::new(setup.stall_s, task::LEAD_S, Random::new(*seed, 4));
     let (mut force_n, mut bytes) = (DVec3::ZERO, 0);
     for tick in 0..ticks(*duration_s) {
         let now_s = f64::from(tick) * TICK_S;
         let place_m = held.place_m;
-        totals.moved(place_m);
+        totals.moved(place_m, twin.second_work_j());
         if totals.is_unstable() || (place_m - task.start_m()).length() > UNSTABLE_AMPLITUDES * task.amplitude_m {
             totals.outcome.unstable_at_s = Some(now_s);
             break;
         }
         let is_stalled = stalls.at(now_s).is_some();
+        let second_m = own.as_ref().map(|own| own.place_m(spot, now_s));
         if !is_stalled {
-            poses.tell(now_s, place_m, &client, &mut network.up);
+            poses.tell(now_s, place_m, second_m, &client, &mut network.up);
         }
         bytes += serve(&mut server, &mut network, now_s)?;
         // While the client is stalled, the device holds the last force, and messages wait.
@@ -84,9 +87,16 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
             }
             while let Some(message) = network.down.receive(now_s) {
                 poses.answered(&message, now_s);
+                if let (Some(model), Some([place_m, velocity_m_per_s])) = (&message.model, message.second) {
+                    let time_s = midway_s(model.client_time_s, now_s);
+                    client.follow(setup.tip, MotionState { time_s, place_m, velocity_m_per_s });
+                }
                 if let Some(model) = message.model {
                     client.receive(model, now_s);
                 }
+            }
+            if let Some(place_m) = second_m {
+                client.follow(setup.tip, MotionState { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO });
             }
             force_n = client.tick(now_s, place_m);
         }
@@ -128,10 +138,10 @@ fn serve(server: &mut LinkServer, network: &mut LinkNetwork, now_s: f64) -> Resu
     if let Some(law) = server.take_law(now_s) {
         network.laws.send(now_s, 0, law);
     }
-    let Some(model) = server.step(now_s)? else { return Ok(0) };
+    let Some(Told { model, second }) = server.step(now_s)? else { return Ok(0) };
     let bytes = model.as_ref().map_or(EMPTY_BYTES, sample_bytes);
     let (number, heartbeat_s) = (network.down.sent() + 1, server.heartbeat_s(now_s));
-    network.down.send(now_s, bytes, Down { number, sent_s: now_s, model, heartbeat_s });
+    network.down.send(now_s, bytes, Down { number, sent_s: now_s, model, second, heartbeat_s });
     Ok(bytes)
 }
 

@@ -16,9 +16,9 @@ use palpate_tissue::scene::script::Action;
 
 use super::laws::PlaceLaws;
 use super::poses::Up;
-use super::setup::{Setup, TICK_S};
+use super::setup::{SecondHand, Setup, TICK_S};
 use super::spot::Spot;
-use super::tissue::{LEASE, LinkTissue, ns};
+use super::tissue::{LEASE, LinkTissue, SECOND_LEASE, SECOND_TOOL, TOOL, ns};
 
 /// Time from a change of the tissue until the law of the new tissue is known, s.
 const LAW_S: f64 = 0.1;
@@ -28,6 +28,14 @@ pub(super) struct Other {
     pub(super) number: u32,
     pub(super) law: Arc<Law>,
     pub(super) changed: Option<Arc<Model>>,
+}
+
+/// What a sample tells, in the hand's frame.
+pub(super) struct Told {
+    /// The local model; `None` if the tool has let go.
+    pub(super) model: Option<LocalModel>,
+    /// Place of the second tool, m, and its velocity, m/s, if the sample tells of it.
+    pub(super) second: Option<[DVec3; 2]>,
 }
 
 /// The server's tissue behind a network.
@@ -60,17 +68,22 @@ impl LinkServer {
     /// # Errors
     /// Returns why the intake refuses the tools.
     pub(super) fn new(setup: &Setup) -> Result<Self, String> {
-        let tissue = LinkTissue::new(setup)?;
+        let mut tissue = LinkTissue::new(setup)?;
+        let tells_of_others = setup.second_hand == SecondHand::Another;
+        if setup.second_hand == SecondHand::Own {
+            tissue.second = None;
+        }
         let laws = Arc::new(Laws::new(setup.law.clone()));
         let wanted = Arc::new(WantedHeartbeat::default());
         let rendered = Deadband { rendered_fraction: Some(setup.deadband), ..Deadband::default() };
         let sampling = Sampling {
             every: 1,
-            only: Some(vec![super::tissue::TOOL]),
+            only: Some(vec![TOOL]),
             deadband: (setup.deadband > 0.0).then_some(rendered),
             heartbeat_s: HEARTBEAT_S,
             laws: Some(laws.clone()),
             touch_stiffness: false,
+            other_tools: tells_of_others,
             wanted: Some(wanted.clone()),
         };
         Ok(LinkServer {
@@ -96,17 +109,21 @@ impl LinkServer {
     pub(super) fn receive(&mut self, message: &Up, now_s: f64) {
         self.pulse.arrive(message.number, message.sent_s, now_s);
         self.wanted.set(message.heartbeat_s);
-        let mut commands = Vec::new();
+        let (mut commands, mut seconds) = (Vec::new(), Vec::new());
         for (number, told) in &message.told {
             if self.seen.take(*number) {
-                commands.push(self.command(*number, told));
+                let (tool, second) = told;
+                commands.push(self.command(TOOL, *number, tool));
+                seconds.extend(second.iter().map(|second| self.command(SECOND_TOOL, *number, second)));
             }
         }
-        // As on a server, a refused command has no effect and is counted.
-        self.refused += u64::from(self.tissue.submit(LEASE, commands, now_s).is_err());
+        for (lease, commands) in [(LEASE, commands), (SECOND_LEASE, seconds)] {
+            // As on a server, a refused command has no effect and is counted.
+            self.refused += u64::from(!commands.is_empty() && self.tissue.submit(lease, commands, now_s).is_err());
+        }
     }
 
-    fn command(&self, number: u64, told: &MotionState) -> Command {
+    fn command(&self, tool: u32, number: u64, told: &MotionState) -> Command {
         let mut command = self.tissue.pose(told.place_m);
         if let Action::Pose { velocity_m_per_s, .. } = &mut command.action {
             *velocity_m_per_s = self.is_moving.then(|| self.spot.direction_of_tissue(told.velocity_m_per_s));
@@ -114,22 +131,25 @@ impl LinkServer {
         // The time 0 means none.
         let client_time_ns = ns(told.time_s).max(1);
         let by_datagram = self.transport == Transport::Datagram;
-        Command { sequence: Some(number), client_time_ns, by_datagram, ..command }
+        Command { tool, sequence: Some(number), client_time_ns, by_datagram, ..command }
     }
 
-    /// Does the step that begins at `now_s`. Returns the sample to send, if any; it has no local model if the tool
-    /// has let go.
+    /// Does the step that begins at `now_s`. Returns the sample to send, if any.
     ///
     /// # Errors
     /// Returns the reason if the guard stops the tissue.
-    pub(super) fn step(&mut self, now_s: f64) -> Result<Option<Option<LocalModel>>, String> {
+    pub(super) fn step(&mut self, now_s: f64) -> Result<Option<Told>, String> {
         self.tissue.step(now_s)?;
         let Some(sample) = self.sampler.pick(self.tissue.session(), false) else { return Ok(None) };
         let tool = sample.tools.first();
         if let Some(rest_m) = tool.and_then(|tool| self.disc.pressed_m(tool.feel.as_ref()?)) {
             self.follow(rest_m);
         }
-        Ok(Some(tool.and_then(|tool| tool.local).map(|model| self.spot.of_hand(model))))
+        let model = tool.and_then(|tool| tool.local).map(|model| self.spot.of_hand(model));
+        let second = sample.other_tools.first().map(|other| {
+            [self.spot.of_hand_m(other.motion.place_m), self.spot.direction(other.motion.velocity_m_per_s)]
+        });
+        Ok(Some(Told { model, second }))
     }
 
     /// Changes the law to that of the tissue under the tool, if it presses at another place.

@@ -25,6 +25,28 @@ pub(super) enum Rendering {
     Prediction,
 }
 
+/// Whose hand leads the second tool.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum SecondHand {
+    /// Another client's: this client learns of it by samples
+    Another,
+    /// The other hand of this client, whose places go over the same network
+    Own,
+    /// Another client's, of which samples tell nothing
+    Unknown,
+}
+
+impl SecondHand {
+    /// Returns the name of the option's value, for tables and JSON.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            SecondHand::Another => "another",
+            SecondHand::Own => "own",
+            SecondHand::Unknown => "unknown",
+        }
+    }
+}
+
 /// The setup of a run.
 #[derive(Debug, Clone)]
 pub(super) struct Setup {
@@ -48,6 +70,7 @@ pub(super) struct Setup {
     pub(super) up_deadband: f64,
     /// Distance of a second tool from the place of the task, m; 0: there is no second tool.
     pub(super) second_m: f64,
+    pub(super) second_hand: SecondHand,
     /// A change of the tissue during the run.
     pub(super) change: Option<TissueChange>,
     pub(super) duration_s: f64,

@@ -30,6 +30,11 @@ impl Spot {
         self.at_m + self.above_m + self.turn.transpose() * (place_m - self.at_m)
     }
 
+    /// Converts a place in the tissue's frame to the hand's frame.
+    pub(super) fn of_hand_m(&self, place_m: DVec3) -> DVec3 {
+        self.at_m + self.turn * (place_m - self.above_m - self.at_m)
+    }
+
     /// Converts a direction (a velocity or force) in the tissue's frame to the hand's frame.
     pub(super) fn direction(&self, of_tissue: DVec3) -> DVec3 {
         self.turn * of_tissue
@@ -47,15 +52,14 @@ impl Spot {
 
     /// Converts a local model of the tissue to the hand's frame.
     pub(super) fn of_hand(&self, model: LocalModel) -> LocalModel {
-        let place = |place_m: DVec3| self.at_m + self.turn * (place_m - self.above_m - self.at_m);
         let tensor = |of_tissue: DMat3| self.turn * of_tissue * self.turn.transpose();
         LocalModel {
-            place_m: place(model.place_m),
+            place_m: self.of_hand_m(model.place_m),
             velocity_m_per_s: self.direction(model.velocity_m_per_s),
             force_n: self.direction(model.force_n),
             stiffness_n_per_m: tensor(model.stiffness_n_per_m),
             damping_n_s_per_m: tensor(model.damping_n_s_per_m),
-            surface_m: place(model.surface_m),
+            surface_m: self.of_hand_m(model.surface_m),
             normal: self.direction(model.normal),
             curvature_per_m: tensor(model.curvature_per_m),
             ..model

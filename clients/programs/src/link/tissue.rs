@@ -23,8 +23,8 @@ use super::spot::Spot;
 /// The hand's tool and the second one, with their leases.
 pub(super) const TOOL: u32 = 0;
 pub(super) const LEASE: LeaseId = 1;
-const SECOND_TOOL: u32 = 1;
-const SECOND_LEASE: LeaseId = 2;
+pub(super) const SECOND_TOOL: u32 = 1;
+pub(super) const SECOND_LEASE: LeaseId = 2;
 
 /// Depth of the second tool's presses as a fraction of the task's depths: about the depth that a yielding hand
 /// reaches.
@@ -35,27 +35,35 @@ pub(super) struct LinkTissue {
     simulation: Simulation,
     tip: Tip,
     spot: Spot,
-    second: Option<Second>,
+    /// The second tool, if the tissue leads it.
+    pub(super) second: Option<Second>,
+    /// Place of the second tool, m, and the force on it, N, after the last step; and the work that it has done so far, J.
+    second_before: Option<(DVec3, DVec3)>,
+    second_work_j: f64,
     change: Option<(f64, Arc<Model>)>,
 }
 
 /// A tool that presses by a task of its own and stays at its place.
-struct Second {
+pub(super) struct Second {
     /// Offset from the place of the hand's task, m.
     apart_m: DVec3,
     task: Task,
 }
 
 impl Second {
-    fn new(setup: &Setup) -> Self {
+    /// Returns the second tool of a setup, if it has one.
+    pub(super) fn of(setup: &Setup) -> Option<Self> {
+        if setup.second_m <= 0.0 {
+            return None;
+        }
         let scale = SECOND_DEPTHS * task::scale(&setup.hand, &setup.law, setup.device.most_n());
         let random = &mut Random::new(setup.seed, 6);
         let task = Task::new(DVec3::ZERO, task::LEAD_S, setup.duration_s, scale, random);
-        Second { apart_m: DVec3::new(setup.second_m, 0.0, 0.0), task }
+        Some(Second { apart_m: DVec3::new(setup.second_m, 0.0, 0.0), task })
     }
 
     /// Returns the place of the second tool in the hand's frame, m.
-    fn place_m(&self, spot: &Spot, now_s: f64) -> DVec3 {
+    pub(super) fn place_m(&self, spot: &Spot, now_s: f64) -> DVec3 {
         spot.at_m + self.apart_m + self.task.at(now_s).z * DVec3::Z
     }
 }
@@ -76,7 +84,9 @@ impl LinkTissue {
             simulation,
             tip: setup.tip,
             spot: setup.spot,
-            second: (setup.second_m > 0.0).then(|| Second::new(setup)),
+            second: Second::of(setup),
+            second_before: None,
+            second_work_j: 0.0,
             change: setup.change.as_ref().map(|change| (change.at_s, change.model.clone())),
         })
     }
@@ -84,6 +94,11 @@ impl LinkTissue {
     /// The session.
     pub(super) fn session(&self) -> &Session {
         &self.simulation.session
+    }
+
+    /// Returns the work that the second tool has done on the tissue so far, J.
+    pub(super) fn second_work_j(&self) -> f64 {
+        self.second_work_j
     }
 
     /// Returns a command that moves the tool to a place in the hand's frame. A client time of 0 means at once.
@@ -124,6 +139,12 @@ impl LinkTissue {
                 self.simulation.apply(Input::Tissue(model));
             }
             self.simulation.step(ns(begin_s)).map_err(|refusal| refusal.to_string())?;
+            let felt = self.session().tissue().tool_contact(SECOND_TOOL as usize);
+            let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
+            if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.second_before, now) {
+                self.second_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
+            }
+            self.second_before = now;
             if let Some(reason) = self.session().fault() {
                 return Err(reason);
             }

@@ -40,6 +40,7 @@ pub fn sampling(
         heartbeat_s: heartbeat_s.unwrap_or(HEARTBEAT_S),
         laws: None,
         touch_stiffness: false,
+        other_tools: false,
         wanted: None,
     };
     sampling.check()?;
@@ -67,6 +68,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
         durable_step: paced.durable_step,
         ownership_revision: paced.ownership_revision,
         tools: sample.tools.iter().map(|tool| tool_sample(tool, shape, paced.due_ns, now_ns)).collect(),
+        other_tools: sample.other_tools.iter().map(touch::other_tool).collect(),
     }
 }
 
