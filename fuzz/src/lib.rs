@@ -13,11 +13,13 @@
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use palpate::server::config::Config;
 use palpate::server::identity::{self, KnownCallers, Role};
 use palpate_geometry::{Group, TriangleMesh};
-use palpate_haptics::{Device, Envelope, Law, Renderer};
+use palpate_haptics::{
+    Device, Envelope, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Law, Renderer, Tip,
+};
 use palpate_proto::{datagram as of_touch, pb, touch};
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};
@@ -276,6 +278,17 @@ fn command_all(messages: &[pb::Command]) -> bool {
     true
 }
 
+/// A shaft and two jaws, whose tips are tools 0 to 2.
+fn grasper() -> pb::Instrument {
+    let tip = |offset_m, part| InstrumentTip { offset_m, tip: Tip { radius_m: 0.02, ..Tip::default() }, part };
+    let tips = vec![
+        tip(-0.05 * DVec3::X, InstrumentPart::Body),
+        tip(DVec3::ZERO, InstrumentPart::UpperJaw),
+        tip(DVec3::ZERO, InstrumentPart::LowerJaw),
+    ];
+    palpate_proto::instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X }, 0)
+}
+
 fn request_seeds() -> Vec<Vec<u8>> {
     let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
     let point = pb::GridPoint { x: 2, y: 1 };
@@ -303,20 +316,25 @@ fn request_seeds() -> Vec<Vec<u8>> {
             shape: pb::TipShape::Disc.into(),
         }),
     });
-    let actions = [force, position, pose, pb::command::Action::Release(pb::Release {})];
+    let instrument = pb::command::Action::Instrument(palpate_proto::instrument::pose(&InstrumentPose {
+        place_m: DVec3::new(0.1, 0.1, 0.01),
+        orientation: DQuat::IDENTITY,
+        jaw_rad: 0.4,
+    }));
+    let actions = [force, position, pose, instrument, pb::command::Action::Release(pb::Release {})];
     let command = |index: usize| pb::Command {
         tool: index as u32 % 3,
         sequence: Some(index as u64 + 1),
         client_time_ns: index as u64 * 1_000_000,
         at_step: (index == 1).then_some(1),
         time_to_live_s: (index == 2).then_some(0.001),
-        action: Some(actions[index % 4]),
+        action: Some(actions[index % 5]),
     };
-    let commands: Vec<_> = (0..4).map(command).collect();
+    let commands: Vec<_> = (0..5).map(command).collect();
     let deadband = pb::Deadband { force_n: Some(0.01), force_fraction: Some(0.1), ..Default::default() };
     let open = pb::TouchOpen {
         session_id: "0123456789abcdef".into(),
-        tools: vec![0, 2],
+        tools: vec![0, 1, 2],
         sample_every_steps: Some(2),
         lease_s: Some(1.0),
         holder: "somebody".into(),
@@ -328,6 +346,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         datagrams: true,
         lease_id: "0123456789abcdef0123456789abcdef".into(),
         other_tools: true,
+        instruments: vec![grasper()],
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
     let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));
@@ -477,7 +496,7 @@ fn datagram_seeds() -> Vec<Vec<u8>> {
     let posed = |sequence: u64, moves: bool| {
         let place_m = DVec3::new(0.1, 0.1, 1e-4 * sequence as f64);
         let velocity_m_per_s = moves.then_some(pb::Vector3 { x: 0.01, y: 0.0, z: -0.1 });
-        let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &palpate_haptics::Tip::default()) };
+        let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &Tip::default()) };
         of_touch::Posed { sequence, client_time_ns: 1_000_000 * (1 + sequence), pose }
     };
     let poses = |tool: u32, moves: bool| {
@@ -822,7 +841,7 @@ fn snapshot_seeds() -> Vec<Vec<u8>> {
         arrival_ns: 5,
         ..Command::new(tool, Some(sequence), action)
     };
-    let (shape, tip) = (model().shape(), palpate_haptics::Tip { radius_m: 0.03, ..Default::default() });
+    let (shape, tip) = (model().shape(), Tip { radius_m: 0.03, ..Default::default() });
     let middle_m = shape.rest_m(shape.nearest(shape.extent().middle_m()));
     let poke = Poke {
         point: None,

@@ -187,7 +187,7 @@ pub struct Command {
     #[prost(double, optional, tag = "5")]
     pub time_to_live_s: ::core::option::Option<f64>,
     /// The action.
-    #[prost(oneof = "command::Action", tags = "6, 7, 8, 9")]
+    #[prost(oneof = "command::Action", tags = "6, 7, 8, 9, 10")]
     pub action: ::core::option::Option<command::Action>,
 }
 /// Nested message and enum types in `Command`.
@@ -203,6 +203,10 @@ pub mod command {
         Release(super::Release),
         #[prost(message, tag = "9")]
         Pose(super::Pose),
+        /// Moves all tips of an instrument; `tool` is its first, and `sequence` is required. On an instrument only this and
+        /// `release` are possible.
+        #[prost(message, tag = "10")]
+        Instrument(super::InstrumentPose),
     }
 }
 impl ::prost::Name for Command {
@@ -361,6 +365,86 @@ impl ::prost::Name for Tip {
         "/palpate.v1.Tip".into()
     }
 }
+/// A rigid set of tips, some of them on two jaws, that one pose moves. Each tip is a tool of the stream. The instrument
+/// has a frame of its own, whose origin is the position of its pose: it points along x, and its jaws turn about an axis
+/// along z.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Instrument {
+    /// The tool of the first tip; those of the others follow. All are in TouchOpen.tools, and in no other instrument.
+    #[prost(uint32, tag = "1")]
+    pub first_tool: u32,
+    /// 1 to 64. A shaft or a jaw is a row of tips, at most a radius apart.
+    #[prost(message, repeated, tag = "2")]
+    pub tips: ::prost::alloc::vec::Vec<InstrumentTip>,
+    /// The hinge of the jaws, in the instrument's frame.
+    #[prost(message, optional, tag = "3")]
+    pub hinge_m: ::core::option::Option<Vector3>,
+}
+impl ::prost::Name for Instrument {
+    const NAME: &'static str = "Instrument";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Instrument".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Instrument".into()
+    }
+}
+/// A tip of an instrument.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct InstrumentTip {
+    /// Its place in the instrument's frame; on a jaw, that while the jaws are closed.
+    #[prost(message, optional, tag = "1")]
+    pub offset_m: ::core::option::Option<Vector3>,
+    /// It touches, and has no spring. Absent: as in `Pose`.
+    #[prost(message, optional, tag = "2")]
+    pub tip: ::core::option::Option<Tip>,
+    #[prost(enumeration = "InstrumentPart", tag = "3")]
+    pub part: i32,
+}
+impl ::prost::Name for InstrumentTip {
+    const NAME: &'static str = "InstrumentTip";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.InstrumentTip".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.InstrumentTip".into()
+    }
+}
+/// The instrument is moved here by the end of the step; otherwise as `Pose`. Tips that are far from the tissue at rest, by
+/// a quarter of its longest side, are released until they come nearer: they would cost time and feel nothing.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct InstrumentPose {
+    /// Position of the instrument's origin, in the tissue's frame.
+    #[prost(message, optional, tag = "1")]
+    pub position_m: ::core::option::Option<Vector3>,
+    /// Turns vectors of the instrument's frame into the tissue's; of length 1 within 1e-3. Absent: not rotated.
+    #[prost(message, optional, tag = "2")]
+    pub orientation: ::core::option::Option<Quaternion>,
+    /// The angle between the jaws, 0 to pi; 0 while they are closed, and without jaws.
+    #[prost(double, tag = "3")]
+    pub jaw_rad: f64,
+    /// As Pose.velocity_m_per_s, for the origin. The next two count only with it.
+    #[prost(message, optional, tag = "4")]
+    pub velocity_m_per_s: ::core::option::Option<Vector3>,
+    /// Angular velocity, in the tissue's frame.
+    #[prost(message, optional, tag = "5")]
+    pub angular_velocity_rad_per_s: ::core::option::Option<Vector3>,
+    /// Velocity of the angle between the jaws.
+    #[prost(double, tag = "6")]
+    pub jaw_velocity_rad_per_s: f64,
+}
+impl ::prost::Name for InstrumentPose {
+    const NAME: &'static str = "InstrumentPose";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.InstrumentPose".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.InstrumentPose".into()
+    }
+}
 /// A spring with a damper in parallel.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Spring {
@@ -472,6 +556,9 @@ pub struct TouchOpen {
     /// waiting for the samples of its own tool.
     #[prost(bool, tag = "13")]
     pub other_tools: bool,
+    /// Instruments whose tips are tools of this stream. Their poses go by the stream, not by datagram.
+    #[prost(message, repeated, tag = "14")]
+    pub instruments: ::prost::alloc::vec::Vec<Instrument>,
 }
 impl ::prost::Name for TouchOpen {
     const NAME: &'static str = "TouchOpen";
@@ -1030,6 +1117,9 @@ pub struct Sample {
     /// number; of more than 32 the first.
     #[prost(message, repeated, tag = "16")]
     pub other_tools: ::prost::alloc::vec::Vec<OtherTool>,
+    /// The instruments of this stream that have a pose.
+    #[prost(message, repeated, tag = "17")]
+    pub instruments: ::prost::alloc::vec::Vec<InstrumentSample>,
 }
 impl ::prost::Name for Sample {
     const NAME: &'static str = "Sample";
@@ -1039,6 +1129,35 @@ impl ::prost::Name for Sample {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Sample".into()
+    }
+}
+/// What an instrument felt at the end of a step: the sum of the forces on its tips.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct InstrumentSample {
+    #[prost(uint32, tag = "1")]
+    pub first_tool: u32,
+    /// The point about which the torque is: the position of the instrument's origin at this step, by the client's poses.
+    #[prost(message, optional, tag = "2")]
+    pub about_m: ::core::option::Option<Vector3>,
+    /// The force of the tissue on the instrument.
+    #[prost(message, optional, tag = "3")]
+    pub force_on_tool_n: ::core::option::Option<Vector3>,
+    /// The torque of the tissue on the instrument, about `about_m`.
+    #[prost(message, optional, tag = "4")]
+    pub torque_on_tool_n_m: ::core::option::Option<Vector3>,
+    /// The torque with which the tissue opens the jaws; its product with the angle's velocity is their power. Absent
+    /// without jaws.
+    #[prost(double, optional, tag = "5")]
+    pub opening_n_m: ::core::option::Option<f64>,
+}
+impl ::prost::Name for InstrumentSample {
+    const NAME: &'static str = "InstrumentSample";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.InstrumentSample".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.InstrumentSample".into()
     }
 }
 /// A tool of another stream at the end of a step.
@@ -1567,6 +1686,43 @@ impl TipShape {
             "TIP_SHAPE_DISC" => Some(Self::Disc),
             "TIP_SHAPE_RIGID_DISC" => Some(Self::RigidDisc),
             "TIP_SHAPE_SPHERE" => Some(Self::Sphere),
+            _ => None,
+        }
+    }
+}
+/// What of an instrument a tip belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum InstrumentPart {
+    /// As INSTRUMENT_PART_BODY.
+    Unspecified = 0,
+    /// The body, which moves as the instrument does.
+    Body = 1,
+    /// The jaw that opens towards y.
+    UpperJaw = 2,
+    /// The jaw that opens towards -y.
+    LowerJaw = 3,
+}
+impl InstrumentPart {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "INSTRUMENT_PART_UNSPECIFIED",
+            Self::Body => "INSTRUMENT_PART_BODY",
+            Self::UpperJaw => "INSTRUMENT_PART_UPPER_JAW",
+            Self::LowerJaw => "INSTRUMENT_PART_LOWER_JAW",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "INSTRUMENT_PART_UNSPECIFIED" => Some(Self::Unspecified),
+            "INSTRUMENT_PART_BODY" => Some(Self::Body),
+            "INSTRUMENT_PART_UPPER_JAW" => Some(Self::UpperJaw),
+            "INSTRUMENT_PART_LOWER_JAW" => Some(Self::LowerJaw),
             _ => None,
         }
     }

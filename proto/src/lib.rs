@@ -11,12 +11,13 @@
 //!   such limits.
 //! - `datagram` (feature `datagrams`): limits and conversions that both ends of datagrams share.
 //! - [`scene`]: what the message of a scene says about its tissue.
-//! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-haptics`.
+//! - [`geometry`], [`instrument`] and [`touch`]: conversion of vectors, of instruments, and of the types of the crate `palpate-haptics`.
 
 pub mod codec;
 #[cfg(feature = "datagrams")]
 pub mod datagram;
 pub mod geometry;
+pub mod instrument;
 pub mod measure;
 pub mod scene;
 pub mod touch;

@@ -183,6 +183,25 @@ async fn a_bridge_that_touched_nothing_says_so_and_tells_the_session_that_it_kee
     assert_eq!(server.status(session_id).await.scene_name, "paper");
 }
 
+/// Two simulated devices in one program, each with its own tool of one session: both are felt, and both render from a copy.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_devices_of_one_bridge_lead_a_tool_each() {
+    let server = TestServer::start(&[]);
+    let session_id = create(at(&server).connect().await.unwrap(), "liver").await;
+    let options =
+        ["--server", &server.url, "--session", &session_id, "--seconds", "4", "--prediction", "always", "--json"];
+    let mut bridge = std::process::Command::new(server::client_program());
+    let ran = bridge.arg("bridge").args(options).args(["--second-device", "touch", "--second-tool", "3"]).output();
+    let ran = ran.unwrap();
+    assert!(ran.status.success(), "{}", String::from_utf8_lossy(&ran.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&ran.stdout).unwrap();
+    for hand in [&report, &report["second"]] {
+        assert_eq!((&hand["connections"], &hand["commands_refused"]), (&1.into(), &0.into()), "{report}");
+        assert!(hand["largest_force_n"].as_f64().unwrap() > 0.05, "{report}");
+        assert!(hand["predicted_ticks"].as_u64().unwrap() > 100, "{report}");
+    }
+}
+
 #[tokio::test]
 async fn what_a_server_refuses_at_first_ends_the_bridge() {
     let server = TestServer::start(&[]);

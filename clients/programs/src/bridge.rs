@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::HapticDevice;
-use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run};
-use palpate_client::devices::{self, DeviceKind, Placed};
+use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run, two_hands};
+use palpate_client::devices::{self, DeviceKind, Placed, Placement};
 use palpate_haptics::{LimitCause, RenderingState, Tip, TipShape};
 use palpate_refusal::printable::printable_json;
 use palpate_simulated::random::Random;
@@ -13,7 +13,7 @@ use palpate_simulated::task::{LEAD_S, Task};
 use serde_json::json;
 
 use crate::credentials::CredentialOptions;
-use crate::placement::PlacementOptions;
+use crate::placement::{PlacementOptions, vector};
 use crate::prediction::When;
 use crate::simulated::{Simulated, device_named, hand_named};
 use crate::{ClientFailure, interrupted, table, warn};
@@ -38,6 +38,16 @@ pub(crate) struct BridgeArguments {
     /// or undeclared
     #[arg(long, value_name = "NAME", default_value = "omega3")]
     device: String,
+    /// A second device, for the other hand, with a tool of its own in the same session. The library, the hand and the placement
+    /// are those of the first, but for --second-offset-m
+    #[arg(long, value_name = "NAME", requires = "session")]
+    second_device: Option<String>,
+    /// The tool of the second device [default: one more than --tool]
+    #[arg(long, value_name = "NUMBER", requires = "second_device")]
+    second_tool: Option<u32>,
+    /// Offset of the second device's workspace from that of the first, m
+    #[arg(long, value_name = "X,Y,Z", value_parser = vector, allow_hyphen_values = true, default_value = "0.02,0,0")]
+    second_offset_m: DVec3,
     /// The library of the device's maker, if it is not where the system looks for libraries
     #[arg(long, value_name = "FILE")]
     library: Option<std::path::PathBuf>,
@@ -89,18 +99,18 @@ pub(crate) struct BridgeArguments {
 /// Scale of the depths of the simulated hand's presses.
 const SCALE: f64 = 0.2;
 
-/// Opens a real device, or makes a simulated one.
-fn device(arguments: &BridgeArguments) -> Result<Box<dyn HapticDevice>, ClientFailure> {
-    if DeviceKind::of(&arguments.device).is_some() {
-        return Ok(devices::open(&arguments.device, arguments.library.as_deref())?);
+/// Opens the real device of a name, or makes a simulated one, whose hand moves by a stream of random numbers.
+fn device(arguments: &BridgeArguments, name: &str, stream: u64) -> Result<Box<dyn HapticDevice>, ClientFailure> {
+    if DeviceKind::of(name).is_some() {
+        return Ok(devices::open(name, arguments.library.as_deref())?);
     }
     let hand = hand_named(&arguments.hand)?;
-    let device = device_named(&arguments.device).map_err(|refusal| {
+    let device = device_named(name).map_err(|refusal| {
         let real: Vec<&str> = DeviceKind::ALL.iter().map(|kind| kind.1).collect();
         ClientFailure::Refused(format!("{refusal}; or a real device: {}", real.join(", ")))
     })?;
     let seconds = arguments.seconds.unwrap_or(3600.0);
-    let task = Task::new(DVec3::ZERO, LEAD_S, seconds, SCALE, &mut Random::new(arguments.seed, 0));
+    let task = Task::new(DVec3::ZERO, LEAD_S, seconds, SCALE, &mut Random::new(arguments.seed, stream));
     Ok(Box::new(Simulated::new(device, hand, task, false)))
 }
 
@@ -127,19 +137,44 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
     let lasts = lasts.map_err(|error| ClientFailure::Refused(format!("--seconds: {error}")))?;
     // Last, so that what is refused is refused before a device moves.
-    let device = Placed::new(device(arguments)?, placement)?;
-    let (remembers, keeps_session) = (arguments.course.is_some(), arguments.keep_session);
-    let (warn, copies) = (Some(Box::new(warn) as Warn), arguments.prediction.copies());
-    let options = Options { lasts, remembers, keeps_session, warn, copies, ..Options::default() };
-    let (_, served) = run(device, target, options, interrupted()).await?;
+    let first = Placed::new(device(arguments, &arguments.device, 0)?, placement)?;
+    let remembers = arguments.course.is_some();
+    let options = |hand| {
+        let (warn, copies) = (Some(Box::new(warn) as Warn), arguments.prediction.copies());
+        let keeps_session = arguments.keep_session;
+        Options { lasts, remembers, keeps_session, warn, copies, hand, ..Options::default() }
+    };
+    let (served, second) = match &arguments.second_device {
+        None => (run(first, target, options(None), interrupted()).await?.1, None),
+        Some(name) => {
+            let tool = arguments.second_tool.unwrap_or(arguments.tool.saturating_add(1));
+            let placement = Placement { offset_m: placement.offset_m + arguments.second_offset_m, ..placement };
+            let device = Placed::new(device(arguments, name, 1)?, placement)?;
+            let ([left, right], beside) = (two_hands(), Target { tool, ..target.clone() });
+            let both = tokio::try_join!(
+                run(first, target, options(Some(left)), interrupted()),
+                run(device, beside, options(Some(right)), interrupted())
+            );
+            let (one, other) = both?;
+            (one.1, Some(other.1))
+        }
+    };
     if let Some(path) = &arguments.course {
         write_course(path, &served.course)?;
     }
     let session_id = arguments.session.as_deref().or(served.made.as_deref());
     if arguments.json {
-        crate::tell!("{}", printable_json(as_json(&served, session_id)));
+        let mut report = as_json(&served, session_id);
+        if let Some(second) = &second {
+            report["second"] = as_json(second, session_id);
+        }
+        crate::tell!("{}", printable_json(report));
     } else {
         table::print(&rows(&served));
+        if let Some(second) = &second {
+            crate::tell!("\nsecond device");
+            table::print(&rows(second));
+        }
     }
     if let Some(id) = served.made.as_ref().filter(|_| arguments.keep_session) {
         let url = &arguments.server;
@@ -147,7 +182,8 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
         crate::say!("palpate-client: touch it again with `palpate-client bridge --server {url} --session {id}`");
         crate::say!("palpate-client: end it with `palpate-client admin delete {id} --server {url}`");
     }
-    served.lost.map_or(Ok(()), |error| Err(error.into()))
+    let lost = served.lost.or(second.and_then(|second| second.lost));
+    lost.map_or(Ok(()), |error| Err(error.into()))
 }
 
 /// The results for programs.

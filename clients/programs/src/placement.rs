@@ -40,7 +40,8 @@ pub(crate) struct PlacementOptions {
     no_clutch: bool,
 }
 
-fn vector(text: &str) -> std::result::Result<DVec3, String> {
+/// Parses three numbers with commas between them.
+pub(crate) fn vector(text: &str) -> std::result::Result<DVec3, String> {
     let numbers: std::result::Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
     let numbers = numbers.map_err(|_| "must be three numbers, as in 0,0,0.01".to_owned())?;
     <[f64; 3]>::try_from(numbers).map(DVec3::from_array).map_err(|_| "must be three numbers, as in 0,0,0.01".to_owned())

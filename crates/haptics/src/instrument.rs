@@ -75,6 +75,29 @@ impl InstrumentPose {
     }
 }
 
+/// How fast an instrument moves.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct InstrumentVelocity {
+    /// Velocity of the instrument's origin, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// Angular velocity, rad/s, in the tissue's frame.
+    pub angular_rad_per_s: DVec3,
+    /// Velocity of the angle between the jaws, rad/s.
+    pub jaw_rad_per_s: f64,
+}
+
+impl InstrumentVelocity {
+    /// Returns the pose after a time, s, at this velocity.
+    #[must_use]
+    pub fn after(&self, pose: &InstrumentPose, time_s: f64) -> InstrumentPose {
+        InstrumentPose {
+            place_m: pose.place_m + self.velocity_m_per_s * time_s,
+            orientation: turned(self.angular_rad_per_s * time_s, pose.orientation),
+            jaw_rad: (pose.jaw_rad + self.jaw_rad_per_s * time_s).clamp(0.0, MAX_JAW_RAD),
+        }
+    }
+}
+
 /// A force and a torque on an instrument, both of the tissue.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Wrench {
@@ -127,6 +150,20 @@ impl Instrument {
         pose.place_m + pose.orientation * in_frame_m
     }
 
+    /// Returns the velocity of a tip by its number, m/s, in the tissue's frame. Panics if there is no such tip.
+    pub fn tip_velocity_m_per_s(&self, number: usize, pose: &InstrumentPose, velocity: &InstrumentVelocity) -> DVec3 {
+        let (axis, hinge_m) = self.hinge(pose);
+        let (tip_m, turn) = (self.tip_m(number, pose), self.tips[number].part.turn());
+        velocity.velocity_m_per_s
+            + velocity.angular_rad_per_s.cross(tip_m - pose.place_m)
+            + turn * velocity.jaw_rad_per_s * axis.cross(tip_m - hinge_m)
+    }
+
+    /// Returns the axis of the jaws and their hinge, m, in the tissue's frame.
+    fn hinge(&self, pose: &InstrumentPose) -> (DVec3, DVec3) {
+        (pose.orientation * DVec3::Z, pose.place_m + pose.orientation * self.hinge_m)
+    }
+
     /// Returns the wrench of forces on the tips (number and N, in the tissue's frame) about the instrument's place.
     pub fn wrench(&self, pose: &InstrumentPose, forces_n: impl IntoIterator<Item = (usize, DVec3)>) -> Wrench {
         forces_n.into_iter().fold(Wrench::default(), |sum, (number, force_n)| Wrench {
@@ -138,7 +175,7 @@ impl Instrument {
     /// Returns the torque with which forces on the tips (number and N, in the tissue's frame) open the jaws, N·m: half the difference
     /// of the torques on both jaws about their hinge, so that its product with the angle's velocity is their power.
     pub fn opening_n_m(&self, pose: &InstrumentPose, forces_n: impl IntoIterator<Item = (usize, DVec3)>) -> f64 {
-        let (axis, hinge_m) = (pose.orientation * DVec3::Z, pose.place_m + pose.orientation * self.hinge_m);
+        let (axis, hinge_m) = self.hinge(pose);
         let of = |(number, force_n): (usize, DVec3)| {
             self.tips[number].part.turn() * (self.tip_m(number, pose) - hinge_m).cross(force_n).dot(axis)
         };
@@ -152,6 +189,14 @@ const NEARLY_EQUAL: f64 = 1.0 - 1e-12;
 /// Returns the rotation by an angle about z. (glam's own takes sine and cosine from the system, whose last digits differ.)
 fn about_z(angle_rad: f64) -> DQuat {
     DQuat::from_xyzw(0.0, 0.0, libm::sin(0.5 * angle_rad), libm::cos(0.5 * angle_rad))
+}
+
+/// Returns an orientation after a turn by a vector of angles, rad, with the same bits on every system.
+fn turned(by_rad: DVec3, orientation: DQuat) -> DQuat {
+    let angle_rad = by_rad.length();
+    let Some(axis) = by_rad.try_normalize() else { return orientation };
+    let DVec3 { x, y, z } = axis * libm::sin(0.5 * angle_rad);
+    (DQuat::from_xyzw(x, y, z, libm::cos(0.5 * angle_rad)) * orientation).normalize()
 }
 
 /// Returns the orientation at a part of the shorter turn from one to another, with the same bits on every system.
@@ -209,11 +254,9 @@ mod tests {
         let rotation = DVec3::new(0.3, -0.7, 0.5);
         let (velocity, opening) = (DVec3::new(0.2, 0.1, -0.4), 0.9);
         let dt = 1e-6;
-        let after = InstrumentPose {
-            place_m: before.place_m + dt * velocity,
-            orientation: DQuat::from_scaled_axis(dt * rotation) * before.orientation,
-            jaw_rad: before.jaw_rad + dt * opening,
-        };
+        let moving =
+            InstrumentVelocity { velocity_m_per_s: velocity, angular_rad_per_s: rotation, jaw_rad_per_s: opening };
+        let after = moving.after(&before, dt);
         let forces_n: Vec<_> = (0..instrument.tips.len())
             .map(|tip| (tip, DVec3::new((tip as f64).sin(), 0.3, (tip as f64).cos())))
             .collect();
@@ -223,6 +266,10 @@ mod tests {
         let power_w: f64 = forces_n.iter().map(moved).sum();
         let Wrench { force_n, torque_n_m } = instrument.wrench(&before, forces_n.iter().copied());
         let opening_n_m = instrument.opening_n_m(&before, forces_n.iter().copied());
+        for tip in 0..instrument.tips.len() {
+            let moved_m_per_s = (instrument.tip_m(tip, &after) - instrument.tip_m(tip, &before)) / dt;
+            assert!(moved_m_per_s.distance(instrument.tip_velocity_m_per_s(tip, &before, &moving)) < 1e-5, "{tip}");
+        }
         let expected_w = force_n.dot(velocity) + torque_n_m.dot(rotation) + opening_n_m * opening;
         assert!((power_w / expected_w - 1.0).abs() < 1e-5, "{power_w} {expected_w}");
         // About any point the power is the same.

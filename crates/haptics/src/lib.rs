@@ -75,7 +75,7 @@ pub use deadband::ForceDeadband;
 pub use device::Device;
 pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use force_law::Law;
-pub use instrument::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Wrench};
+pub use instrument::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Wrench};
 pub use local_model::{ContactState, LocalModel, Touching, Track};
 pub use prediction::{OtherTool, Predicted, Prediction, Predictor};
 pub use renderer::Renderer;

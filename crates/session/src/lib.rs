@@ -25,6 +25,7 @@ pub mod intake;
 pub mod intake_transfer;
 pub mod journal;
 pub mod lease;
+pub mod led_instrument;
 pub mod local_model;
 pub mod queue;
 pub mod recovery;

@@ -5,21 +5,28 @@ use std::sync::Arc;
 
 use palpate_haptics::datagram_health::ReceiveWindow;
 use palpate_haptics::device::Device;
-use palpate_proto::{datagram, pb};
+use palpate_proto::{datagram, instrument, pb};
 use tracing::{debug, info};
 
 use super::event::StreamEvent;
+use super::instruments::Instruments;
 use crate::server::rate::Bucket;
 use crate::server::traffic::Traffic;
 use palpate_realtime::SessionHandle;
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::queue::Writer;
-use palpate_refusal::{Refusal, Result, number};
+use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_session::command::Command;
 use palpate_session::lease::LeaseId;
+use palpate_session::led_instrument::LedInstrument;
+use palpate_session::rules::Commands;
 use palpate_session::wire;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
 use palpate_tissue::scene::script::Action;
+
+/// What the rate of a stream limits, for messages.
+const COMMANDS: &str = "commands of this stream";
 
 /// The holder of the tools of one lease: checks, limits and submits its commands.
 pub(super) struct LeaseController {
@@ -28,6 +35,7 @@ pub(super) struct LeaseController {
     device: Option<Device>,
     traffic: Arc<Traffic>,
     commands: Bucket,
+    instruments: Instruments,
     /// For each tool whose poses may arrive twice (by stream and by datagram): the sequence numbers that have
     /// arrived.
     seen: BTreeMap<u32, ReceiveWindow>,
@@ -54,7 +62,7 @@ fn may_overtake(command: &pb::Command) -> bool {
 
 impl LeaseController {
     /// Creates the controller of the tools of a lease. `by_datagram`: their poses may arrive by datagram as well.
-    #[allow(clippy::cast_precision_loss)]
+    #[allow(clippy::cast_precision_loss, clippy::too_many_arguments)] // Its callers have them all.
     pub(super) fn new(
         handle: Arc<SessionHandle>,
         lease: LeaseId,
@@ -63,13 +71,14 @@ impl LeaseController {
         by_datagram: bool,
         limits: &Limits,
         traffic: Arc<Traffic>,
+        instruments: Instruments,
     ) -> Self {
         // A rate per step and tool, and a burst of twice the number of commands that may wait.
         let seen = tools.iter().filter(|_| by_datagram).map(|tool| (*tool, ReceiveWindow::default())).collect();
         let tools = tools.len().max(1) as f64;
         let per_s = limits.commands_per_step * handle.model.scene.stepping.rate_hz * tools;
         let commands = Bucket::new(per_s, per_s.max(2.0 * limits.queued_commands_per_tool as f64 * tools));
-        LeaseController { handle, lease, device, traffic, commands, seen }
+        LeaseController { handle, lease, device, traffic, commands, instruments, seen }
     }
 
     /// Accepts a command of the stream. Sends a rejection to `events` if it is refused.
@@ -112,6 +121,47 @@ impl LeaseController {
         self.commands.take(now_ns, "messages of this stream").map_err(|refusal| (refusal, self.commands.is_abused()))
     }
 
+    /// Accepts a command to a single tool.
+    fn command_tool(&mut self, message: &pb::Command, by_datagram: bool, now: u64) -> Result<()> {
+        self.commands.take(now, COMMANDS)?;
+        let command = wire::command::from_command(message, self.handle.model.shape(), now)?;
+        let command = within_reach(command, &self.handle, self.device.as_ref())?;
+        self.handle.submit(self.lease, [Command { by_datagram, ..command }]).map(drop)
+    }
+
+    /// Accepts a command to an instrument: one to each of its tools, or none.
+    fn lead(&mut self, instrument: &mut LedInstrument, message: &pb::Command, now: u64) -> Result<()> {
+        use pb::command::Action as Message;
+        let first = instrument.first_tool();
+        let refuse = |reason, field: &str, text: String| Err(Refusal::new(reason, field, text));
+        if message.tool != first {
+            let text = format!("is a tip of the instrument whose first tool is {first}: command that");
+            return refuse(Reason::WrongKind, "tool", text);
+        }
+        let Some(sequence) = message.sequence else {
+            return refuse(Reason::Missing, "sequence", "is missing: an instrument needs it".to_owned());
+        };
+        (0..instrument.instrument().tips.len()).try_for_each(|_| self.commands.take(now, COMMANDS))?;
+        let command = wire::command::with_action(message, Action::Release, now);
+        let command = Command { sequence: Some(sequence), ..command };
+        match &message.action {
+            Some(Message::Instrument(pose)) => {
+                let (pose, velocity) = instrument::from_pose(pose, instrument.instrument().has_jaws())?;
+                let commands = instrument.lead(&command, &pose, velocity.as_ref(), self.handle.model.shape());
+                let reached = |command| within_reach(command, &self.handle, self.device.as_ref());
+                let commands = commands.into_iter().map(reached).collect::<Result<Commands>>()?;
+                self.handle.submit(self.lease, commands)?;
+                instrument.accepted(&command, pose, velocity);
+                Ok(())
+            }
+            Some(Message::Release(_)) => {
+                let commands: Commands = instrument.release(&command).into_iter().collect();
+                self.handle.submit(self.lease, commands).map(drop)
+            }
+            _ => refuse(Reason::WrongKind, "action", "must be `instrument` or `release` for an instrument".to_owned()),
+        }
+    }
+
     fn is_new(&mut self, command: &pb::Command) -> bool {
         // Commands to tools of other holders are refused in `take`.
         let seen = self.seen.get_mut(&command.tool).zip(command.sequence);
@@ -119,13 +169,13 @@ impl LeaseController {
     }
 
     fn take(&mut self, message: &pb::Command, by_datagram: bool, events: &Writer<StreamEvent>) -> Result<()> {
-        let (handle, now) = (&self.handle, now_ns());
-        let taken = self
-            .commands
-            .take(now, "commands of this stream")
-            .and_then(|()| wire::command::from_command(message, handle.model.shape(), now))
-            .and_then(|command| within_reach(command, handle, self.device.as_ref()))
-            .and_then(|command| handle.submit(self.lease, [Command { by_datagram, ..command }]).map(drop));
+        let now = now_ns();
+        let instruments = self.instruments.clone();
+        let taken = match lock(&instruments).iter_mut().find(|instrument| instrument.has(message.tool)) {
+            Some(instrument) => self.lead(instrument, message, now),
+            None => self.command_tool(message, by_datagram, now),
+        };
+        let handle = &self.handle;
         self.traffic.commanded(usize::from(taken.is_ok()));
         let Err(refusal) = taken else { return Ok(()) };
         handle.count_refused(1);

@@ -8,6 +8,7 @@ use prost::Message;
 use tracing::{Instrument, debug, info};
 
 use super::event::StreamEvent;
+use super::instruments::Instruments;
 use super::lease_controller::LeaseController;
 use super::response_stream::ResponseStream;
 use super::stream::KeepaliveTimer;
@@ -47,13 +48,17 @@ pub(super) async fn offer(
     let guard = handle.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
     let (offer, arrival) = services.datagrams.offer()?.ok_or_else(not_available)?;
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    let controller = LeaseController::new(handle.clone(), lease, &tools, None, true, limits, traffic);
+    // A lease of AcquireTool is of one tool: it has no instruments.
+    let instruments = Instruments::default();
+    let controller =
+        LeaseController::new(handle.clone(), lease, &tools, None, true, limits, traffic, instruments.clone());
     let channel = Arc::new(DatagramChannel::new(controller.pace()));
     sampling.wanted = Some(channel.wanted());
     let (events, heard) = queue(limits.queued_samples);
     let cut = guard.cut().clone();
     let samples = handle.samples(sampling, Some(account));
-    let responses = ResponseStream::new(None, heard, samples, Notices::new(tools, step), guard, channel.clone());
+    let notices = Notices::new(tools, step);
+    let responses = ResponseStream::new(None, heard, samples, notices, guard, channel.clone(), instruments);
     let session = LeaseSession { controller, responses, channel, arrival: Some(arrival), events };
     let serving = async move {
         tokio::select! {

@@ -1,6 +1,7 @@
 //! `HapticService`: streams of commands and samples, tools, single commands, and records of probes.
 
 mod event;
+mod instruments;
 mod lease_controller;
 mod lease_session;
 mod pending_messages;

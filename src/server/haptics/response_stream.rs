@@ -8,6 +8,7 @@ use palpate_proto::pb;
 use tonic::Status;
 
 use super::event::StreamEvent;
+use super::instruments::Instruments;
 use crate::server::datagrams::DatagramChannel;
 use crate::server::force_law::Updates;
 use crate::server::recovered::Notices;
@@ -16,6 +17,7 @@ use palpate_realtime::clock::now_ns;
 use palpate_realtime::queue::Reader;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
+use palpate_tissue::lock::lock;
 
 /// Longest interval between samples on the stream while they go by datagram, ns.
 const HEARTBEAT_NS: u64 = 1_000_000_000;
@@ -27,6 +29,7 @@ pub(super) struct ResponseStream {
     samples: Reader<PacedSample>,
     notices: Notices,
     channel: Arc<DatagramChannel>,
+    instruments: Instruments,
     /// When the last sample was sent on the stream, ns.
     streamed_ns: u64,
     /// The messages before the next sample, and that sample.
@@ -44,6 +47,7 @@ impl ResponseStream {
         notices: Notices,
         guard: StreamGuard,
         channel: Arc<DatagramChannel>,
+        instruments: Instruments,
     ) -> Self {
         ResponseStream {
             updates,
@@ -51,6 +55,7 @@ impl ResponseStream {
             samples,
             notices,
             channel,
+            instruments,
             streamed_ns: 0,
             ready: VecDeque::new(),
             dropped_answers: 0,
@@ -99,7 +104,9 @@ impl ResponseStream {
             let dropped_answers = self.dropped_answers;
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
-            let sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
+            let mut sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
+            let felt = lock(&self.instruments).iter().filter_map(|led| led.sample(&paced.sample)).collect::<Vec<_>>();
+            sample.instruments = felt.iter().map(super::instruments::message).collect();
             // The stream has a heartbeat of its own, which shows a client that it still works.
             let (now, by_datagram) = (now_ns(), self.channel.send(&sample));
             if !by_datagram || now.saturating_sub(self.streamed_ns) >= HEARTBEAT_NS {

@@ -1,7 +1,7 @@
 //! The haptic stream: opens it, and reads what its client sends.
 
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ use tonic::{Status, Streaming};
 use tracing::{Instrument, debug, info};
 
 use super::event::StreamEvent;
+use super::instruments::{Instruments, instruments};
 use super::lease_controller::LeaseController;
 use super::pending_messages::PendingMessages;
 use super::response_stream::ResponseStream;
@@ -44,6 +45,7 @@ struct Opened {
     notices: Notices,
     guard: StreamGuard,
     channel: Arc<DatagramChannel>,
+    instruments: Instruments,
 }
 
 /// The tools of a stream, released when it ends for any reason.
@@ -112,6 +114,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     if device.is_some() || open.tip.is_some() {
         check_tip("tip", handle.model.shape(), &tip)?;
     }
+    let instruments: Instruments = Arc::new(Mutex::new(instruments(open, handle.model.shape())?));
     let only = (!open.tools.is_empty()).then(|| open.tools.clone());
     let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
     let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
@@ -152,7 +155,16 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     // The tools are held from here on: any failure below releases them.
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    let controller = LeaseController::new(handle.clone(), lease, &open.tools, device, open.datagrams, limits, traffic);
+    let controller = LeaseController::new(
+        handle.clone(),
+        lease,
+        &open.tools,
+        device,
+        open.datagrams,
+        limits,
+        traffic,
+        instruments.clone(),
+    );
     let channel = Arc::new(DatagramChannel::new(controller.pace()));
     let mut held =
         StreamTools { tools, controller, channel: channel.clone(), offered_ns: None, arrival: None, _computing };
@@ -178,7 +190,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let samples = handle.samples(sampling, open.tools.is_empty().then_some(account));
     info!(session = %handle.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
     let notices = Notices::new(open.tools.clone(), step);
-    Ok((Opened { answer, updates, samples, notices, guard, channel }, held))
+    Ok((Opened { answer, updates, samples, notices, guard, channel, instruments }, held))
 }
 
 /// Opens a stream and reads the client's messages in a task of its own, until it ends.
@@ -312,8 +324,10 @@ impl Stream for Output {
         let stage = &mut self.get_mut().stage;
         let message = match stage {
             StreamStage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
-                (Ok(Ok(Opened { answer, updates, samples, notices, guard, channel })), Some(events)) => {
-                    *stage = StreamStage::Open(ResponseStream::new(updates, events, samples, notices, guard, channel));
+                (Ok(Ok(opened)), Some(events)) => {
+                    let Opened { answer, updates, samples, notices, guard, channel, instruments } = opened;
+                    let responses = ResponseStream::new(updates, events, samples, notices, guard, channel, instruments);
+                    *stage = StreamStage::Open(responses);
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),

@@ -2,5 +2,6 @@
 
 mod commands;
 mod contact;
+mod instruments;
 mod laws;
 mod poses;

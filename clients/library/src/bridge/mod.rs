@@ -8,6 +8,7 @@
 
 mod copy_fetch;
 mod copy_thread;
+mod hands;
 mod lateness;
 mod line;
 mod offline;
@@ -30,6 +31,7 @@ use crate::device::HapticDevice;
 use crate::os::{self, Priority};
 use line::{Commands, Shared};
 
+pub use hands::{Hand, two_hands};
 pub use line::Traffic;
 pub use offline::{Offline, OfflineNetwork};
 pub use tick::{TICK_S, Tick};
@@ -111,7 +113,7 @@ impl Disable {
 
 /// Options of [`run`] and [`begin`]. By default there is no time limit, nothing is recorded or shown, the priority is
 /// the usual one, a created session is deleted at the end, and no tissue is copied. [`begin`] uses only
-/// `keeps_session`, `warn` and `copies`.
+/// `keeps_session`, `warn`, `copies` and `hand`.
 #[derive(Default)]
 pub struct Options {
     /// Time after which [`run`] ends, from the first tick, which does not wait for a connection; `None`: no limit.
@@ -133,16 +135,19 @@ pub struct Options {
     /// it, however long that takes: while it is late, or if it can't be built, forces come from local models. `None`:
     /// only from those.
     pub copies: Option<Copies>,
+    /// One of the two hands of this client ([`two_hands`]), whose other one leads another tool of the same session: each copy of
+    /// the tissue then has both tools without a delay. `None`: this device is the only one.
+    pub hand: Option<Hand>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, copies } = self;
+        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, copies, hand } = self;
         let mut fields = f.debug_struct("Options");
         fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
         fields.field("keeps_session", keeps_session);
         fields.field("warn", &warn.is_some()).field("begun", &begun.is_some());
-        fields.field("copies", &copies.is_some()).finish()
+        fields.field("copies", &copies.is_some()).field("hand", &hand.is_some()).finish()
     }
 }
 
@@ -232,11 +237,11 @@ pub async fn run_told<D: HapticDevice + 'static>(
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, BridgeReport), Error> {
-    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, copies } = options;
+    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, copies, hand } = options;
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
     let (ticker, mut line) =
-        line(target, copies, descriptor, PositionOrigin::Workspace, keeps_session, warn.clone(), stop);
+        line(target, copies, hand, descriptor, PositionOrigin::Workspace, keeps_session, warn.clone(), stop);
     let (news, of_loop) = (line.news.clone(), warn.clone());
     let (tell, ended) = oneshot::channel();
     std::thread::Builder::new().name("device".to_owned()).spawn(move || {
@@ -297,9 +302,11 @@ fn silent() -> Error {
 }
 
 /// Starts to connect in a task. Returns the half of the loop and the connection.
+#[allow(clippy::too_many_arguments)] // Its callers have them all.
 fn line(
     target: Target,
     copies: Option<Copies>,
+    hand: Option<Hand>,
     device: Device,
     origin: PositionOrigin,
     keeps_session: bool,
@@ -308,6 +315,7 @@ fn line(
 ) -> (Ticker, Connection) {
     let server = target.server.clone();
     let (ticker, feed, queue) = ticker::ticker(device, origin, target.up_deadband);
+    let ticker = ticker.of_hand(hand, target.tool, target.tip);
     let (shared, news) = (Arc::new(Shared::default()), Arc::new(Notify::new()));
     let commands = Commands { queue, news: news.clone() };
     let mut network = JoinSet::new();
@@ -331,7 +339,7 @@ const ROUND: Duration = Duration::from_micros(250);
 
 /// Connects a loop of your own to `target`. Waits for the first connection, at most ten seconds; later ones are
 /// opened automatically. `device` describes the limits of the forces; it is also sent to the server. `origin` is the
-/// frame of the readings. Of `options`, only `keeps_session`, `warn` and `copies` are used. Call it within a Tokio
+/// frame of the readings. Of `options`, only `keeps_session`, `warn`, `copies` and `hand` are used. Call it within a Tokio
 /// runtime, which must run as long as the connection.
 ///
 /// A tick wakes no thread, because that would be a call of the system. A courier thread notices within a quarter of a
@@ -346,9 +354,9 @@ pub async fn begin(
     origin: PositionOrigin,
     options: Options,
 ) -> Result<(Ticker, Connection), Error> {
-    let Options { keeps_session, warn, copies, .. } = options;
+    let Options { keeps_session, warn, copies, hand, .. } = options;
     let (ticker, mut line) =
-        line(target, copies, device, origin, keeps_session, Arc::new(warn), std::future::pending());
+        line(target, copies, hand, device, origin, keeps_session, Arc::new(warn), std::future::pending());
     let (commands, news) = (ticker.commands_view(), line.news.clone());
     std::thread::Builder::new().name("bridge-wake".to_owned()).spawn(move || {
         while !commands.is_over() {

@@ -10,11 +10,12 @@ use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_haptics::prediction::{MAX_OTHERS, midway_s};
 use palpate_haptics::renderer::MAX_LAWS;
 use palpate_haptics::{
-    Device, Envelope, Law, LocalModel, MotionState, OtherTool, Prediction, Predictor, Renderer, RenderingState,
+    Device, Envelope, Law, LocalModel, MotionState, OtherTool, Prediction, Predictor, Renderer, RenderingState, Tip,
 };
 use palpate_proto::{pb, touch};
 use std::collections::VecDeque;
 
+use super::hands::Hand;
 use crate::Error;
 use crate::device::Reading;
 use crate::exchange::{NewestReader, NewestWriter, QueueReader, QueueView, QueueWriter, newest, queue};
@@ -101,7 +102,12 @@ pub struct Ticker {
     news: News,
     clock: Clock,
     place_m: DVec3,
-    /// The other tools of the newest model; kept so that a tick allocates nothing.
+    /// One of two hands of this client, with its tool and tip.
+    hand: Option<(Hand, u32, Tip)>,
+    /// The time by the client's clock at which the other tools of the newest model were where it says, s; `None` before the
+    /// first model.
+    others_time_s: Option<f64>,
+    /// The other tools; kept so that a tick allocates nothing.
     others: Vec<OtherTool>,
 }
 
@@ -147,7 +153,9 @@ pub(super) fn ticker(
         news: News::default(),
         clock: Clock::default(),
         place_m: DVec3::ZERO,
-        others: Vec::with_capacity(MAX_OTHERS),
+        hand: None,
+        others_time_s: None,
+        others: Vec::with_capacity(1 + MAX_OTHERS),
     };
     let feed = LoopFeed {
         told: to_learn,
@@ -191,6 +199,12 @@ impl Clock {
 }
 
 impl Ticker {
+    /// Returns this loop as that of one of two hands, if `hand` is one, which leads a tool with a tip.
+    #[must_use]
+    pub(super) fn of_hand(self, hand: Option<Hand>, tool: u32, tip: Tip) -> Self {
+        Ticker { hand: hand.map(|hand| (hand, tool, tip)), ..self }
+    }
+
     /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`, s. The times may
     /// have any origin and must advance between ticks. Returns zero before the first connection. Queues a pose for the
     /// network; drops it if 64 wait. A change of [`Reading::enable`] from false to true enables forces.
@@ -219,17 +233,28 @@ impl Ticker {
         }
         let Newest { connection, model, others, wanted_s } = self.newest.read();
         let (connection, wanted_s) = (*connection, *wanted_s);
-        if self.is_fresh && connection == self.connection {
-            self.is_fresh = false;
-            if let Some(model) = model {
-                let time_s = midway_s(model.client_time_s, now_s);
+        let is_news = self.is_fresh && connection == self.connection;
+        if let Some(model) = model.filter(|_| is_news) {
+            self.others_time_s = Some(midway_s(model.client_time_s, now_s));
+            renderer.receive(model, now_s);
+        }
+        self.is_fresh &= !is_news;
+        let of_time = |other: OtherTool, time_s| OtherTool { motion: MotionState { time_s, ..other.motion }, ..other };
+        let mut second = None;
+        if let Some((hand, tool, tip)) = &mut self.hand {
+            let motion = MotionState { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO };
+            hand.tell(Some(OtherTool { tool: *tool, tip: *tip, motion }));
+            second = hand.other().map(|other| of_time(other, now_s));
+        }
+        if is_news || self.hand.is_some() {
+            self.others.clear();
+            self.others.extend(second);
+            if let Some(time_s) = self.others_time_s.filter(|_| connection == self.connection) {
                 let known = others.iter().map_while(|other| *other);
-                self.others.clear();
-                self.others
-                    .extend(known.map(|other| OtherTool { motion: MotionState { time_s, ..other.motion }, ..other }));
-                renderer.follow_others(&self.others);
-                renderer.receive(*model, now_s);
+                let known = known.filter(|other| second.is_none_or(|second| second.tool != other.tool));
+                self.others.extend(known.map(|other| of_time(other, time_s)));
             }
+            renderer.follow_others(&self.others);
         }
         let force_n = renderer.tick(now_s, place_m);
         if !(place_m.is_finite() && now_s.is_finite()) {
@@ -268,7 +293,7 @@ impl Ticker {
                     }
                     // The envelope of an earlier connection stays: a pause remains, and a rendered force falls at the
                     // slew limit.
-                    (self.connection, self.origin_m) = (connection, origin_m);
+                    (self.connection, self.origin_m, self.others_time_s) = (connection, origin_m, None);
                 }
                 LoopEvent::Learn { number, law } => {
                     self.renderer.learn_with(number, law, |law| give_back(Used::Law(law)));
@@ -412,5 +437,79 @@ impl LoopFeed {
         let Self { connection, model, others, wanted_s, .. } = *self;
         let newest = Newest { connection, model, others, wanted_s };
         self.newest.write(|place| *place = newest);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use palpate_haptics::{ContactState, Predicted};
+
+    use super::super::hands::two_hands;
+    use super::*;
+
+    /// A copy that says which other tools it is given.
+    struct TellingCopy(NewestWriter<Vec<OtherTool>>);
+
+    impl Predictor for TellingCopy {
+        fn feel(&mut self, _: f64, _: DVec3, others: &[OtherTool]) -> Option<Predicted> {
+            self.0.write(|told| *told = others.to_vec());
+            Some(Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free, others_work_j: 0.0 })
+        }
+    }
+
+    fn sample(sequence: u64, client_time_ns: u64, other_tools: Vec<pb::OtherTool>) -> pb::Sample {
+        let local_model = Some(pb::LocalModel { sequence, client_time_ns, ..Default::default() });
+        let tools = vec![pb::ToolSample { local_model, ..Default::default() }];
+        pb::Sample { tools, other_tools, ..Default::default() }
+    }
+
+    #[test]
+    fn a_copy_has_the_own_second_hand_at_once_and_other_clients_tools_by_samples() {
+        let device = Device::named("omega3").unwrap();
+        let [left, right] = two_hands();
+        let one_of = |hand: Hand, tool: u32| {
+            let (ticker, feed, commands) = ticker(device, PositionOrigin::Tissue, 0.0);
+            let tip = Tip { radius_m: 0.003 + 1e-3 * f64::from(tool), ..Tip::default() };
+            (ticker.of_hand(Some(hand), tool, tip), feed, commands)
+        };
+        let (mut left, mut left_feed, _left_commands) = one_of(left, 0);
+        let (mut right, mut right_feed, _right_commands) = one_of(right, 1);
+        let law = touch::law(&Law::linear(400.0, 0.5), 0);
+        let (say, mut told) = newest(&Vec::new());
+        let mut heard = || {
+            assert!(told.refresh());
+            told.read().clone()
+        };
+        left_feed.begin(&law, DVec3::ZERO).unwrap();
+        left_feed.predict(Some(Box::new(TellingCopy(say))));
+        let at = |x_m: f64| Reading { place_m: DVec3::new(x_m, 0.0, 0.0), enable: true };
+        left.tick(at(0.0), 0.000);
+        // The other hand has no connection yet.
+        assert_eq!(heard(), []);
+        right_feed.begin(&law, DVec3::ZERO).unwrap();
+        right.tick(at(0.02), 0.0005);
+        left.tick(at(0.0), 0.001);
+        let [other] = heard()[..] else { panic!("one other tool") };
+        assert_eq!((other.tool, other.tip.radius_m, other.motion.place_m.x), (1, 0.004, 0.02));
+        // Its clock began at another moment: the place counts for now.
+        assert!((other.motion.time_s - 1.001).abs() < 1e-9, "{}", other.motion.time_s);
+        // A sample that is 40 ms old knows the second hand too, and another client's tool, which it saw 20 ms ago.
+        let seen = |tool: u32, x_m: f64| pb::OtherTool {
+            tool,
+            position_m: Some(pb::Vector3 { x: x_m, y: 0.0, z: 0.0 }),
+            ..Default::default()
+        };
+        left_feed.receive(&sample(1, 1_000_000_000, vec![seen(1, 0.01), seen(5, 0.03)]), 0.0);
+        left.tick(at(0.0), 0.040);
+        let [own, another] = heard()[..] else { panic!("two other tools") };
+        assert_eq!((own.tool, own.motion.place_m.x), (1, 0.02));
+        assert_eq!((another.tool, another.motion.place_m.x), (5, 0.03));
+        assert!((another.motion.time_s - 1.020).abs() < 1e-9, "{}", another.motion.time_s);
+        drop(right);
+        left.tick(at(0.0), 0.041);
+        let left_over: Vec<u32> = heard().iter().map(|other| other.tool).collect();
+        // The server still has its tool.
+        assert_eq!(left_over, [1, 5]);
     }
 }

@@ -57,8 +57,18 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
             tip: from_tip("pose.tip", pose.tip.as_ref())?,
         },
         Message::Release(_) => Action::Release,
+        Message::Instrument(_) => {
+            let message =
+                format!("is for an instrument of this stream, and tool {} is the first tip of none", message.tool);
+            return Err(Refusal::new(Reason::WrongKind, "instrument", message));
+        }
     };
-    Ok(Command {
+    Ok(with_action(message, action, arrival_ns))
+}
+
+/// Returns a command with an action of its own and all else from a message.
+pub fn with_action(message: &pb::Command, action: Action, arrival_ns: u64) -> Command {
+    Command {
         tool: message.tool,
         sequence: message.sequence,
         client_time_ns: message.client_time_ns,
@@ -67,7 +77,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
         time_to_live_s: message.time_to_live_s,
         action,
         arrival_ns,
-    })
+    }
 }
 
 /// Returns the place of a force in space, m; on a sheet, the nearest one in its rest plane.

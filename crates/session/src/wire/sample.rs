@@ -69,6 +69,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
         ownership_revision: paced.ownership_revision,
         tools: sample.tools.iter().map(|tool| tool_sample(tool, shape, paced.due_ns, now_ns)).collect(),
         other_tools: sample.other_tools.iter().map(touch::other_tool).collect(),
+        instruments: Vec::new(),
     }
 }
 

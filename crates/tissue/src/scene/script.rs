@@ -26,6 +26,12 @@ pub const BUILT_IN: [(&str, &str); 7] = [
 /// Distance from the tissue at rest from which on a tip of an instrument is not led, divided by the longest side of the tissue.
 const FAR_OF_SIDE: f64 = 0.25;
 
+/// Returns whether the tip of an instrument at a place is led: it is at most a quarter of the tissue's longest side from the
+/// tissue at rest. Farther away it would cost time and feel nothing.
+pub fn is_led(shape: &dyn RestShape, place_m: DVec3, radius_m: f64) -> bool {
+    shape.extent().distance_m(place_m) <= FAR_OF_SIDE * shape.longest_side_m() + radius_m
+}
+
 /// A script bound to a scene: what tools do over time, and what is recorded. [`Script::load`] and
 /// [`Script::parse`] create it, with times as whole steps of the scene's rate. Tools are numbered from 0:
 /// forces first, then grasped points, then tips.
@@ -92,10 +98,8 @@ impl Script {
     #[allow(clippy::cast_precision_loss)]
     pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let first = self.first_tip().unwrap_or_default();
-        let far_m = FAR_OF_SIDE * self.shape.longest_side_m();
-        let extent = self.shape.extent();
-        let is_led = move |profile: &PoseProfile, place_m: &DVec3| {
-            profile.mounted.is_none() || extent.distance_m(*place_m) <= far_m + profile.tip.radius_m
+        let is_led = |profile: &PoseProfile, place_m: &DVec3| {
+            profile.mounted.is_none() || is_led(&*self.shape, *place_m, profile.tip.radius_m)
         };
         let place_m = move |profile: &PoseProfile, end: u64| {
             profile.at(end as f64 / self.rate_hz).filter(|place_m| is_led(profile, place_m))

@@ -1,0 +1,56 @@
+//! The instruments of a haptic stream.
+
+use std::sync::{Arc, Mutex};
+
+use palpate_proto::{instrument, pb};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::led_instrument::{InstrumentSample, LedInstrument};
+use palpate_tissue::scene::action_check::check_tip;
+use palpate_tissue::shape::RestShape;
+
+/// The instruments of a stream, which its commands move and its samples tell of.
+pub(super) type Instruments = Arc<Mutex<Vec<LedInstrument>>>;
+
+/// Reads the instruments that a stream declares.
+///
+/// # Errors
+/// Refuses an instrument that is not valid ([`instrument::from_instrument`]), a tip that does not suit the tissue, a tip whose tool
+/// the stream does not ask for, and a tool that two instruments have.
+pub(super) fn instruments(open: &pb::TouchOpen, shape: &dyn RestShape) -> Result<Vec<LedInstrument>> {
+    let mut read: Vec<LedInstrument> = Vec::new();
+    for (index, message) in open.instruments.iter().enumerate() {
+        let field = format!("instruments[{index}]");
+        let instrument = instrument::from_instrument(&field, message)?;
+        for (number, tip) in instrument.tips.iter().enumerate() {
+            check_tip(&format!("{field}.tips[{number}].tip"), shape, &tip.tip)?;
+        }
+        let tools = (message.first_tool..).take(instrument.tips.len());
+        for tool in tools.clone() {
+            let wrong = |message: String| Err(Refusal::new(Reason::OutOfRange, format!("{field}.first_tool"), message));
+            if !open.tools.contains(&tool) {
+                return wrong(format!("makes a tip of tool {tool}, which is not among the tools of the stream"));
+            }
+            if read.iter().any(|other| other.has(tool)) {
+                return wrong(format!("makes a tip of tool {tool}, which another instrument has"));
+            }
+        }
+        // The numbers of tools end before those of 32 bits.
+        if tools.count() < instrument.tips.len() {
+            return Err(Refusal::new(Reason::OutOfRange, format!("{field}.first_tool"), "is too large"));
+        }
+        read.push(LedInstrument::new(instrument, message.first_tool));
+    }
+    Ok(read)
+}
+
+/// Converts what an instrument felt to a message.
+pub(super) fn message(sample: &InstrumentSample) -> pb::InstrumentSample {
+    use palpate_proto::geometry::vector;
+    pb::InstrumentSample {
+        first_tool: sample.first_tool,
+        about_m: vector(sample.about_m),
+        force_on_tool_n: vector(sample.wrench.force_n),
+        torque_on_tool_n_m: vector(sample.wrench.torque_n_m),
+        opening_n_m: sample.opening_n_m,
+    }
+}

@@ -1,0 +1,230 @@
+//! Instruments over a real server: one pose moves all tips, samples have the wrench, and what is wrong is named.
+
+use crate::common::server::{TestServer, TestTouch, open, told};
+use glam::{DQuat, DVec3};
+use palpate_haptics::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Tip};
+use palpate_proto::geometry::{from_vector, vector};
+use palpate_proto::pb::command::Action;
+use palpate_proto::{instrument, pb, touch};
+
+/// A shaft of 20 mm, and jaws of 8 mm: 5 + 3 + 3 tips.
+fn grasper() -> Instrument {
+    let tip = Tip { radius_m: 0.004, friction: 0.3, ..Tip::default() };
+    let mut instrument = Instrument { hinge_m: -0.01 * DVec3::X, ..Instrument::default() };
+    instrument.add_row(-0.01 * DVec3::X, -0.026 * DVec3::X, tip, InstrumentPart::Body);
+    instrument.add_row(-0.008 * DVec3::X, DVec3::ZERO, tip, InstrumentPart::UpperJaw);
+    instrument.add_row(-0.008 * DVec3::X, DVec3::ZERO, tip, InstrumentPart::LowerJaw);
+    assert_eq!(instrument.tips.len(), 11);
+    instrument
+}
+
+/// The pose at a step: down onto `liver`, tilted and turning, while the jaws close.
+fn pose_at(step: u64) -> InstrumentPose {
+    let part = (step as f64 / 300.0).min(1.0);
+    let pose = InstrumentPose {
+        place_m: DVec3::new(0.045, 0.0375, 0.004 - 0.006 * part),
+        orientation: DQuat::from_rotation_z(0.6 * part) * DQuat::from_rotation_y(0.1),
+        jaw_rad: 0.8 * (1.0 - part),
+    };
+    // As the server reads it: rounding of the orientation is part of the bits.
+    instrument::from_pose(&instrument::pose(&pose), true).unwrap().0
+}
+
+const FIRST: u32 = 2;
+
+fn tools() -> Vec<u32> {
+    (FIRST..FIRST + 11).collect()
+}
+
+async fn liver(server: &TestServer) -> String {
+    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
+    let request = pb::CreateSessionRequest { source, paused: true, ..Default::default() };
+    server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id
+}
+
+async fn start(server: &TestServer, session: &str, until_step: u64) {
+    let request = pb::StartSessionRequest { session_id: session.to_owned(), until_step: Some(until_step) };
+    server.sessions().await.start_session(request).await.unwrap();
+}
+
+fn with_grasper(session: &str) -> pb::TouchOpen {
+    let instruments = vec![instrument::instrument(&grasper(), FIRST)];
+    pb::TouchOpen { instruments, ..open(session, &tools()) }
+}
+
+fn command(step: u64, pose: pb::InstrumentPose) -> pb::Command {
+    let action = Some(Action::Instrument(pose));
+    pb::Command { tool: FIRST, sequence: Some(step + 1), at_step: Some(step), action, ..Default::default() }
+}
+
+fn forces_n(sample: &pb::Sample) -> Vec<DVec3> {
+    sample.tools.iter().map(|tool| from_vector(tool.force_on_tool_n.as_ref())).collect()
+}
+
+/// The tips have the forces of tools that are led one by one, bit by bit, and the wrench is their sum.
+#[tokio::test]
+async fn one_pose_moves_all_tips_and_samples_have_the_wrench() {
+    const STEPS: u64 = 300;
+    let server = TestServer::start(&[]);
+    let (together, apart) = (liver(&server).await, liver(&server).await);
+    let mut as_one = TestTouch::open(&server, with_grasper(&together)).await.unwrap();
+    let mut as_many = TestTouch::open(&server, open(&apart, &tools())).await.unwrap();
+    let grasper = grasper();
+    for step in 0..STEPS {
+        let pose = pose_at(step + 1);
+        as_one.command(command(step, instrument::pose(&pose))).await;
+        for (number, tool) in (FIRST..).take(grasper.tips.len()).enumerate() {
+            let action = Some(Action::Pose(touch::pose(grasper.tip_m(number, &pose), &grasper.tips[number].tip)));
+            let command = pb::Command { tool, action, ..command(step, pb::InstrumentPose::default()) };
+            as_many.command(command).await;
+        }
+    }
+    as_one.settle().await;
+    as_many.settle().await;
+    start(&server, &together, STEPS).await;
+    start(&server, &apart, STEPS).await;
+    let whole = as_one.sample_with(|sample| sample.step == STEPS).await;
+    let parts = as_many.sample_with(|sample| sample.step == STEPS).await;
+    let forces_n = (forces_n(&whole), forces_n(&parts));
+    assert_eq!(forces_n.0, forces_n.1);
+    assert!(forces_n.0.iter().filter(|force_n| force_n.z > 0.01).count() >= 6, "{:?}", forces_n.0);
+    assert_eq!(parts.instruments, []);
+    let [felt] = &whole.instruments[..] else { panic!("{whole:?}") };
+    let pose = pose_at(STEPS);
+    assert_eq!((felt.first_tool, from_vector(felt.about_m.as_ref())), (FIRST, pose.place_m));
+    let numbered = || forces_n.0.iter().copied().enumerate();
+    let wrench = grasper.wrench(&pose, numbered());
+    assert_eq!(from_vector(felt.force_on_tool_n.as_ref()), wrench.force_n);
+    assert_eq!(from_vector(felt.torque_on_tool_n_m.as_ref()), wrench.torque_n_m);
+    assert!(wrench.torque_n_m.length() > 1e-4, "{wrench:?}");
+    assert_eq!(felt.opening_n_m, Some(grasper.opening_n_m(&pose, numbered())));
+    // One release lets go of all.
+    let release = Some(Action::Release(pb::Release {}));
+    as_one
+        .command(pb::Command { sequence: Some(1000), at_step: None, action: release, ..command(0, Default::default()) })
+        .await;
+    as_one.settle().await;
+    start(&server, &together, STEPS + 1).await;
+    let after = as_one.sample_with(|sample| sample.step == STEPS + 1).await;
+    assert_eq!(after.instruments, []);
+}
+
+/// Poses by the client's time are played back, also with velocities: the wrench is told about where the instrument is then.
+#[tokio::test]
+async fn an_instrument_is_led_by_the_clients_time() {
+    let server = TestServer::start(&[]);
+    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
+    let request = pb::CreateSessionRequest { source, ..Default::default() };
+    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
+    let mut touch = TestTouch::open(&server, with_grasper(&session.session_id)).await.unwrap();
+    let velocity = InstrumentVelocity {
+        velocity_m_per_s: -0.02 * DVec3::Z,
+        angular_rad_per_s: 2.0 * DVec3::Z,
+        jaw_rad_per_s: -0.8 / 0.3,
+    };
+    let mut pose = InstrumentPose { jaw_rad: 0.8, ..pose_at(0) };
+    for tick in 0..300_u64 {
+        let told = pb::InstrumentPose {
+            velocity_m_per_s: vector(velocity.velocity_m_per_s),
+            angular_velocity_rad_per_s: vector(velocity.angular_rad_per_s),
+            jaw_velocity_rad_per_s: velocity.jaw_rad_per_s,
+            ..instrument::pose(&pose)
+        };
+        let client_time_ns = (1 + tick) * 1_000_000;
+        touch.command(pb::Command { client_time_ns, at_step: None, ..command(tick, told) }).await;
+        pose = velocity.after(&pose, 1e-3);
+    }
+    let pressed = |sample: &pb::Sample| {
+        let felt = sample.instruments.first().and_then(|felt| felt.force_on_tool_n);
+        felt.is_some_and(|force_n| force_n.z > 0.05)
+    };
+    let sample = touch.sample_with(pressed).await;
+    let about_m = from_vector(sample.instruments[0].about_m.as_ref());
+    // On the way down, or beyond its last pose by what 50 ms of its velocity are.
+    assert!((0.004 - 0.35 * 0.02 - 1e-9..0.004).contains(&about_m.z), "{about_m}");
+    let sum_n: DVec3 = forces_n(&sample).into_iter().sum();
+    assert!(sum_n.distance(from_vector(sample.instruments[0].force_on_tool_n.as_ref())) < 1e-12 * sum_n.length());
+}
+
+#[tokio::test]
+async fn what_is_wrong_with_an_instrument_is_named() {
+    let server = TestServer::start(&[]);
+    let session = liver(&server).await;
+    let message = || instrument::instrument(&grasper(), FIRST);
+    let with = |change: &dyn Fn(&mut pb::Instrument)| {
+        let mut instrument = message();
+        change(&mut instrument);
+        pb::TouchOpen { instruments: vec![instrument], ..open(&session, &tools()) }
+    };
+    let tip = |change: fn(&mut pb::Tip)| {
+        move |instrument: &mut pb::Instrument| change(instrument.tips[3].tip.as_mut().unwrap())
+    };
+    let twice = pb::TouchOpen { instruments: vec![message(), message()], ..open(&session, &tools()) };
+    for (open, reason, field) in [
+        (with(&|instrument| instrument.tips.clear()), "MISSING", "instruments[0].tips"),
+        (with(&|instrument| instrument.tips = vec![instrument.tips[0]; 65]), "TOO_LARGE", "instruments[0].tips"),
+        (with(&tip(|tip| tip.grasps = true)), "WRONG_KIND", "instruments[0].tips[3].tip.grasps"),
+        (with(&tip(|tip| tip.radius_m = -1.0)), "OUT_OF_RANGE", "instruments[0].tips[3].tip.radius_m"),
+        (with(&tip(|tip| tip.shape = 3)), "OUT_OF_RANGE", "instruments[0].tips[3].tip.shape"),
+        (with(&|instrument| instrument.tips[1].part = 9), "OUT_OF_RANGE", "instruments[0].tips[1].part"),
+        (
+            with(&|instrument| instrument.tips[0].offset_m = vector(f64::NAN * DVec3::X)),
+            "NOT_FINITE",
+            "instruments[0].tips[0].offset_m",
+        ),
+        (with(&|instrument| instrument.hinge_m = vector(11.0 * DVec3::X)), "OUT_OF_RANGE", "instruments[0].hinge_m"),
+        (with(&|instrument| instrument.first_tool = 3), "OUT_OF_RANGE", "instruments[0].first_tool"),
+        (with(&|instrument| instrument.first_tool = u32::MAX - 2), "OUT_OF_RANGE", "instruments[0].first_tool"),
+        (twice, "OUT_OF_RANGE", "instruments[1].first_tool"),
+    ] {
+        let refused = TestTouch::open(&server, open).await.err().unwrap();
+        let (_, told_reason, told_field) = told(&refused);
+        assert_eq!((&*told_reason, &*told_field), (reason, field), "{refused:?}");
+    }
+    let mut touch = TestTouch::open(&server, with_grasper(&session)).await.unwrap();
+    let pose = |change: fn(&mut pb::InstrumentPose)| {
+        let mut pose = instrument::pose(&pose_at(0));
+        change(&mut pose);
+        command(0, pose)
+    };
+    let plain = || touch::pose(DVec3::new(0.03, 0.03, 0.01), &Tip::default());
+    for (command, reason, field) in [
+        (pose(|pose| pose.position_m = None), "MISSING", "instrument.position_m"),
+        (pose(|pose| pose.orientation.as_mut().unwrap().w += 0.1), "OUT_OF_RANGE", "instrument.orientation"),
+        (pose(|pose| pose.jaw_rad = 4.0), "OUT_OF_RANGE", "instrument.jaw_rad"),
+        (pose(|pose| pose.jaw_rad = f64::NAN), "NOT_FINITE", "instrument.jaw_rad"),
+        (pose(|pose| pose.position_m = vector(DVec3::splat(f64::INFINITY))), "NOT_FINITE", "instrument.position_m"),
+        (pose(|pose| pose.position_m = vector(DVec3::splat(1e3))), "OUT_OF_RANGE", "instrument.position_m"),
+        (
+            pose(|pose| (pose.velocity_m_per_s, pose.jaw_velocity_rad_per_s) = (vector(DVec3::ZERO), 1e4)),
+            "OUT_OF_RANGE",
+            "instrument.jaw_velocity_rad_per_s",
+        ),
+        (pb::Command { sequence: None, ..pose(|_| {}) }, "MISSING", "sequence"),
+        (pb::Command { tool: FIRST + 1, ..pose(|_| {}) }, "WRONG_KIND", "tool"),
+        (pb::Command { action: Some(Action::Pose(plain())), ..pose(|_| {}) }, "WRONG_KIND", "action"),
+        (pb::Command { action: None, ..pose(|_| {}) }, "WRONG_KIND", "action"),
+    ] {
+        touch.command(command).await;
+        let rejection = touch.rejection().await;
+        assert_eq!((&*rejection.reason, &*rejection.field), (reason, field), "{}", rejection.message);
+    }
+    // Nothing of it has moved a tip, and a tool without an instrument has none.
+    start(&server, &session, 3).await;
+    let sample = touch.sample_with(|sample| sample.step == 3).await;
+    assert!(sample.instruments.is_empty() && forces_n(&sample).iter().all(|force_n| *force_n == DVec3::ZERO));
+    let mut single = TestTouch::open(&server, open(&session, &[0])).await.unwrap();
+    single.command(pb::Command { tool: 0, ..pose(|_| {}) }).await;
+    let rejection = single.rejection().await;
+    assert_eq!((&*rejection.reason, &*rejection.field), ("WRONG_KIND", "instrument"));
+}
+
+#[test]
+fn an_instrument_is_read_as_it_was_written() {
+    let told = InstrumentTip { offset_m: 0.02 * DVec3::Y, tip: Tip::default(), part: InstrumentPart::Body };
+    let grasper = Instrument { tips: [grasper().tips, vec![told]].concat(), ..grasper() };
+    assert_eq!(instrument::from_instrument("", &instrument::instrument(&grasper, 5)).unwrap(), grasper);
+    let (pose, velocity) = instrument::from_pose(&instrument::pose(&pose_at(100)), true).unwrap();
+    assert!(pose.orientation.angle_between(pose_at(100).orientation) < 1e-7 && velocity.is_none());
+    assert_eq!((pose.place_m, pose.jaw_rad), (pose_at(100).place_m, pose_at(100).jaw_rad));
+}
