@@ -218,7 +218,7 @@ fn a_copy_feels_what_a_second_tool_does_to_the_tissue() {
         let run = |hand: &str| {
             let second = format!("--second-tool-mm {gap_mm} --second-hand {hand}");
             link(&format!(
-                "--scene {scene} --scheme prediction --transport datagram --rtt-ms 50 --loss 0.01 {second} --seconds 8"
+                "--scene {scene} --scheme prediction --transport datagram --rtt-ms 50 --loss 0.01 {second} --seconds 5"
             ))
         };
         let [own, another, unknown] = ["own", "another", "unknown"].map(run);

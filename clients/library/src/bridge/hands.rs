@@ -8,19 +8,19 @@ use palpate_haptics::OtherTool;
 use crate::exchange::{NewestReader, NewestWriter, newest};
 
 /// One of two hands, for [`super::Options::hand`]. Each leads a tool of its own in the same session.
-pub struct Hand {
+pub struct BridgeHand {
     own: NewestWriter<Option<OtherTool>>,
     other: NewestReader<Option<OtherTool>>,
 }
 
 /// Creates the two hands of one client.
-pub fn two_hands() -> [Hand; 2] {
+pub fn two_hands() -> [BridgeHand; 2] {
     let (to_right, from_left) = newest(&None);
     let (to_left, from_right) = newest(&None);
-    [Hand { own: to_right, other: from_right }, Hand { own: to_left, other: from_left }]
+    [BridgeHand { own: to_right, other: from_right }, BridgeHand { own: to_left, other: from_left }]
 }
 
-impl Hand {
+impl BridgeHand {
     /// Tells the other hand where the tool of this one is; `None` while it has none.
     pub(super) fn tell(&mut self, tool: Option<OtherTool>) {
         self.own.write(|place| *place = tool);
@@ -33,14 +33,14 @@ impl Hand {
     }
 }
 
-impl Drop for Hand {
+impl Drop for BridgeHand {
     fn drop(&mut self) {
         self.tell(None);
     }
 }
 
-impl fmt::Debug for Hand {
+impl fmt::Debug for BridgeHand {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Hand").finish_non_exhaustive()
+        f.debug_struct("BridgeHand").finish_non_exhaustive()
     }
 }

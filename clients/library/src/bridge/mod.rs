@@ -31,7 +31,7 @@ use crate::device::HapticDevice;
 use crate::os::{self, Priority};
 use line::{Commands, Shared};
 
-pub use hands::{Hand, two_hands};
+pub use hands::{BridgeHand, two_hands};
 pub use line::Traffic;
 pub use offline::{Offline, OfflineNetwork};
 pub use tick::{TICK_S, Tick};
@@ -137,7 +137,7 @@ pub struct Options {
     pub copies: Option<Copies>,
     /// One of the two hands of this client ([`two_hands`]), whose other one leads another tool of the same session: each copy of
     /// the tissue then has both tools without a delay. `None`: this device is the only one.
-    pub hand: Option<Hand>,
+    pub hand: Option<BridgeHand>,
 }
 
 impl fmt::Debug for Options {
@@ -306,7 +306,7 @@ fn silent() -> Error {
 fn line(
     target: Target,
     copies: Option<Copies>,
-    hand: Option<Hand>,
+    hand: Option<BridgeHand>,
     device: Device,
     origin: PositionOrigin,
     keeps_session: bool,

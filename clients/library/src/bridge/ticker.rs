@@ -15,7 +15,7 @@ use palpate_haptics::{
 use palpate_proto::{pb, touch};
 use std::collections::VecDeque;
 
-use super::hands::Hand;
+use super::hands::BridgeHand;
 use crate::Error;
 use crate::device::Reading;
 use crate::exchange::{NewestReader, NewestWriter, QueueReader, QueueView, QueueWriter, newest, queue};
@@ -103,7 +103,7 @@ pub struct Ticker {
     clock: Clock,
     place_m: DVec3,
     /// One of two hands of this client, with its tool and tip.
-    hand: Option<(Hand, u32, Tip)>,
+    hand: Option<(BridgeHand, u32, Tip)>,
     /// The time by the client's clock at which the other tools of the newest model were where it says, s; `None` before the
     /// first model.
     others_time_s: Option<f64>,
@@ -201,7 +201,7 @@ impl Clock {
 impl Ticker {
     /// Returns this loop as that of one of two hands, if `hand` is one, which leads a tool with a tip.
     #[must_use]
-    pub(super) fn of_hand(self, hand: Option<Hand>, tool: u32, tip: Tip) -> Self {
+    pub(super) fn of_hand(self, hand: Option<BridgeHand>, tool: u32, tip: Tip) -> Self {
         Ticker { hand: hand.map(|hand| (hand, tool, tip)), ..self }
     }
 
@@ -468,7 +468,7 @@ mod tests {
     fn a_copy_has_the_own_second_hand_at_once_and_other_clients_tools_by_samples() {
         let device = Device::named("omega3").unwrap();
         let [left, right] = two_hands();
-        let one_of = |hand: Hand, tool: u32| {
+        let one_of = |hand: BridgeHand, tool: u32| {
             let (ticker, feed, commands) = ticker(device, PositionOrigin::Tissue, 0.0);
             let tip = Tip { radius_m: 0.003 + 1e-3 * f64::from(tool), ..Tip::default() };
             (ticker.of_hand(Some(hand), tool, tip), feed, commands)
