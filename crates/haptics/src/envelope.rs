@@ -270,7 +270,7 @@ impl Envelope {
     /// value that is not finite is ignored.
     pub fn supply(&mut self, work_j: f64) {
         if work_j.is_finite() {
-            self.tank_j = (self.tank_j + work_j).min(TANK_J);
+            self.tank_j = (self.tank_j + work_j).clamp(-TANK_J, TANK_J);
         }
     }
 

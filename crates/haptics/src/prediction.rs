@@ -9,8 +9,8 @@
 //! **Correction by samples.** Each sample shows the error of the copy at the sample's own time t₀: e = f(t₀) − c(t₀),
 //! where c is the copy's force. The rendered force is c(now) + e, with e reduced to the fraction |c(now)|/|c(t₀)| if
 //! that is below 1, so that the force falls smoothly when a tip leaves the tissue. What only the server knows takes effect a
-//! round trip late. If the server's tool was a little beside the client's at
-//! t₀ (because a place was lost or not sent), the local model gives f at the client's place.
+//! round trip late. If the server's tool was a little beside the client's at t₀ (because a place was lost or not sent), the
+//! local model gives f at the client's place.
 //!
 //! **Other tools.** The copy has those that the client knows ([`OtherTool`]): its own second tool at once, and those of
 //! other clients by samples, from which they go on at constant velocity. At t₀ the server had another client's tool where

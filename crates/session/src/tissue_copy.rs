@@ -9,8 +9,10 @@ use palpate_haptics::{ContactState, OtherTool, Predicted, Predictor, Tip};
 
 use super::Session;
 use super::command::{Command, Due};
+use super::rules::Rules;
 use palpate_refusal::{Result, legible, number};
 use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
@@ -53,6 +55,8 @@ impl LedTool {
 /// rest. Of the other tools it knows those that are led by poses, as far as the client does.
 pub struct TissueCopy {
     session: Session,
+    /// What the other tools may do: a server is not believed.
+    rules: Rules,
     tip: Tip,
     /// The other tools on the copy.
     others: [Option<LedTool>; MAX_OTHERS],
@@ -71,6 +75,7 @@ impl TissueCopy {
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
         TissueCopy {
             session: Session::new(model),
+            rules: Rules::new(&model.scene, &Limits::default()),
             tip,
             others: [None; MAX_OTHERS],
             others_work_j: 0.0,
@@ -131,7 +136,8 @@ impl TissueCopy {
         Some(())
     }
 
-    /// Leads the other tools to where they are at a time of the client, and releases those that are no longer known.
+    /// Leads the other tools to where they are at a time of the client, and releases those that are no longer known. Ignores
+    /// what a session would refuse.
     fn lead_others(&mut self, time_s: f64, others: &[OtherTool]) {
         let most_m = most_radius_m(self.session.model().shape());
         let known = || others.iter().filter(|other| other.tip.radius_m <= most_m);
@@ -145,9 +151,13 @@ impl TissueCopy {
             let has = |led_tool: &Option<LedTool>| led_tool.is_some_and(|led_tool| led_tool.tool == other.tool);
             let slot = self.others.iter().position(has).or_else(|| self.others.iter().position(Option::is_none));
             let Some(slot) = slot else { continue };
+            let due = led(tool_at(slot), other.motion.at(time_s), other.tip);
+            if self.rules.check_one(&due.command).is_err() {
+                continue;
+            }
             let before = self.others[slot].and_then(|led_tool| led_tool.before);
             self.others[slot] = Some(LedTool { tool: other.tool, tip: other.tip, before });
-            self.due.push(led(tool_at(slot), other.motion.at(time_s), other.tip));
+            self.due.push(due);
         }
     }
 
@@ -289,6 +299,34 @@ mod tests {
         // The other tool matters, and gives the tissue the work of a press of some millimetres.
         assert!(apart_n > 1e-3, "{apart_n} N");
         assert!((1e-6..1e-2).contains(&most_j), "{most_j} J");
+    }
+
+    #[test]
+    fn other_tools_that_make_no_sense_are_left_out() {
+        let model = model();
+        let mut copy = TissueCopy::new(&model, Tip::default());
+        let sound = other(100).unwrap();
+        let with = |tool: u32, tip: Tip, place_m: DVec3| OtherTool {
+            tool,
+            tip,
+            motion: MotionState { place_m, ..sound.motion },
+        };
+        let place_m = sound.motion.place_m;
+        let others = [
+            with(1, Tip { radius_m: f64::NAN, ..Tip::default() }, place_m),
+            with(2, Tip { radius_m: 0.0, ..Tip::default() }, place_m),
+            with(3, Tip { friction: -1.0, ..Tip::default() }, place_m),
+            with(4, Tip { shape: palpate_haptics::TipShape::Sphere, ..Tip::default() }, place_m),
+            with(5, Tip::default(), DVec3::splat(f64::NAN)),
+            with(6, Tip::default(), DVec3::splat(1e300)),
+            sound,
+        ];
+        for tick in 50..150 {
+            let felt = copy.feel(f64::from(tick) * TICK_S, place_m, &others).unwrap();
+            assert!(felt.force_n.is_finite() && felt.others_work_j.is_finite());
+        }
+        let led_tools: Vec<u32> = copy.others.iter().flatten().map(|led_tool| led_tool.tool).collect();
+        assert_eq!(led_tools, [7]);
     }
 
     #[test]
