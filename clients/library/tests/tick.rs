@@ -90,7 +90,7 @@ struct SpringCopy(f64);
 impl Predictor for SpringCopy {
     fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-        Some(Predicted { force_n: self.0 * (-place_m.z).max(0.0) * DVec3::Z, contact_state, others_work_j: 0.0 })
+        Some(Predicted { force_n: self.0 * (-place_m.z).max(0.0) * DVec3::Z, contact_state, own_work_j: 0.0 })
     }
 }
 

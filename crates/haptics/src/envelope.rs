@@ -7,8 +7,8 @@
 //! 2. Soft engage. After `enable`, nothing is rendered until a model is known and its force is below
 //!    [`ENGAGE_BELOW_N`]. Then the force ramps in over [`ENGAGE_S`].
 //! 3. The norm of the force (clamping its components would turn it), and the device's continuous force.
-//! 4. Passivity: no more energy leaves the port than has entered it, and than other tools have put into the tissue
-//!    ([`Envelope::supply`]).
+//! 4. Passivity: no more energy leaves the port than has entered it, and than other tools give to this one
+//!    through the tissue ([`Envelope::supply`]).
 //! 5. Slew: the force changes by at most [`SLEW_N_PER_S`], up and down, in every state.
 //!
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick, as in the passivity observer
@@ -265,9 +265,8 @@ impl Envelope {
         }
     }
 
-    /// Adds the work that other tools have done on the tissue since the last tick, J, to the energy that may leave the port: a
-    /// hand that another one moves through the tissue gets energy from it. Negative if they got back more than they gave. A
-    /// value that is not finite is ignored.
+    /// Adds what other tools have given to this one through the tissue since the last tick, J, to the energy that may leave the
+    /// port: a hand gets energy from another that pushes it. Negative if it went back. A value that is not finite is ignored.
     pub fn supply(&mut self, work_j: f64) {
         if work_j.is_finite() {
             self.tank_j = (self.tank_j + work_j).clamp(-TANK_J, TANK_J);
@@ -618,7 +617,7 @@ mod tests {
 
     /// A hand at rest on the tissue, which another tool pushes out of it: with 1 N over 20 mm.
     #[test]
-    fn a_hand_gets_the_energy_that_another_tool_puts_into_the_tissue_and_no_more() {
+    fn a_hand_gets_the_energy_that_another_tool_gives_it_and_no_more() {
         let rendered_j = |supplied_j: f64| {
             let mut port = Port::new("omega3");
             port.ticks(600, 0.0, 0.0);

@@ -15,8 +15,9 @@
 //! **Other tools.** The copy has those that the client knows ([`OtherTool`]): its own second tool at once, and those of
 //! other clients by samples, from which they go on at constant velocity. At t₀ the server had another client's tool where
 //! that is half a round trip after the copy had it there, so e contains what it did in that time, to and fro. While such a
-//! tool moves, e is therefore the mean over some tenths of a second. The work that the other tools do on the copy may leave
-//! the client's port ([`crate::Envelope::supply`]).
+//! tool moves, e is therefore the mean over some tenths of a second. If the copy, which is passive, has given the client's tool
+//! more energy than it got from it, that comes from other tools, and may leave the client's port
+//! ([`crate::Envelope::supply`]).
 //!
 //! **Selection.** The local model is also computed beside the copy. When a sample arrives, both forecasts for t₀ are
 //! compared with it. If the copy's error over some tenths of a second is larger than the local model's, and larger
@@ -52,8 +53,9 @@ pub struct Predicted {
     pub force_n: DVec3,
     /// State of contact between the tool and the copy.
     pub contact_state: ContactState,
-    /// Work that the other tools have done on the copy since it was made, J: negative if they got more than they gave.
-    pub others_work_j: f64,
+    /// Work that the client's tool has done on the copy since it was made, J: negative if it got more than it gave, because other
+    /// tools have pushed it.
+    pub own_work_j: f64,
 }
 
 /// Another tool on the tissue, as far as the client knows.
@@ -131,8 +133,8 @@ pub struct Prediction {
     /// less.
     squared: [f64; 3],
     is_worse: bool,
-    /// The work of the other tools at the last answer, J.
-    others_work_j: f64,
+    /// The energy that other tools have given to the client's by the last answer, J.
+    supplied_j: f64,
     /// Whether another tool moves by itself.
     others_move: bool,
 }
@@ -150,19 +152,20 @@ impl Prediction {
             compared_s: f64::NEG_INFINITY,
             squared: [0.0; 3],
             is_worse: false,
-            others_work_j: 0.0,
+            supplied_j: 0.0,
             others_move: false,
         }
     }
 
-    /// Moves the tools in the copy. Returns the work that the others have done on it since the last answer, J. It counts
-    /// whatever is rendered: what another tool gives while the copy is not rendered, it may get back while it is.
+    /// Moves the tools in the copy. Returns by how much the energy that others have given to the client's tool has changed since
+    /// the last answer, J.
     pub(crate) fn move_to(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> f64 {
-        let is_sound = |felt: &Predicted| felt.force_n.is_finite() && felt.others_work_j.is_finite();
+        let is_sound = |felt: &Predicted| felt.force_n.is_finite() && felt.own_work_j.is_finite();
         self.now = self.predictor.feel(now_s, place_m, others).filter(is_sound);
         self.others_move = others.iter().any(|other| other.motion.velocity_m_per_s != DVec3::ZERO);
         let Some(now) = self.now else { return 0.0 };
-        now.others_work_j - std::mem::replace(&mut self.others_work_j, now.others_work_j)
+        let supplied_j = (-now.own_work_j).max(0.0);
+        supplied_j - std::mem::replace(&mut self.supplied_j, supplied_j)
     }
 
     /// Stores the forecast for this tick.

@@ -493,7 +493,7 @@ mod tests {
             Some(crate::Predicted {
                 force_n: -400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z,
                 contact_state,
-                others_work_j: 0.0,
+                own_work_j: 0.0,
             })
         }
     }

@@ -31,7 +31,7 @@ struct Copy {
 impl Predictor for Copy {
     fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-        let felt = Predicted { force_n: self.factor * force_n(place_m), contact_state, others_work_j: 0.0 };
+        let felt = Predicted { force_n: self.factor * force_n(place_m), contact_state, own_work_j: 0.0 };
         (!self.is_off.load(Ordering::Relaxed)).then_some(felt)
     }
 }

@@ -39,8 +39,6 @@ struct LedTool {
     /// Its number in the server's session.
     tool: u32,
     tip: Tip,
-    /// Its place, m, and the force on it, N, after the last step that it did.
-    before: Option<(DVec3, DVec3)>,
 }
 
 impl LedTool {
@@ -60,8 +58,9 @@ pub struct TissueCopy {
     tip: Tip,
     /// The other tools on the copy.
     others: [Option<LedTool>; MAX_OTHERS],
-    /// Work that they have done on it, J.
-    others_work_j: f64,
+    /// Place of the client's tool, m, and the force on it, N, after the last step; and the work that it has done so far, J.
+    before: Option<(DVec3, DVec3)>,
+    own_work_j: f64,
     due: Vec<Due>,
     /// The client's time minus the copy's, s; `None` before the first tick.
     ahead_s: Option<f64>,
@@ -78,7 +77,8 @@ impl TissueCopy {
             rules: Rules::new(&model.scene, &Limits::default()),
             tip,
             others: [None; MAX_OTHERS],
-            others_work_j: 0.0,
+            before: None,
+            own_work_j: 0.0,
             due: Vec::with_capacity(1 + 2 * MAX_OTHERS),
             ahead_s: None,
             place_m: DVec3::ZERO,
@@ -155,23 +155,19 @@ impl TissueCopy {
             if self.rules.check_one(&due.command).is_err() {
                 continue;
             }
-            let before = self.others[slot].and_then(|led_tool| led_tool.before);
-            self.others[slot] = Some(LedTool { tool: other.tool, tip: other.tip, before });
+            self.others[slot] = Some(LedTool { tool: other.tool, tip: other.tip });
             self.due.push(due);
         }
     }
 
-    /// Adds the work that the other tools did in the last step: the mean of the forces before and after it times the way.
+    /// Adds the work that the client's tool did in the last step: the mean of the forces before and after it times the way.
     fn count_work(&mut self) {
-        for (slot, led_tool) in self.others.iter_mut().enumerate() {
-            let Some(led_tool) = led_tool else { continue };
-            let felt = self.session.tissue().tool_contact(tool_at(slot) as usize);
-            let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
-            if let (Some((from_m, from_n)), Some((to_m, to_n))) = (led_tool.before, now) {
-                self.others_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
-            }
-            led_tool.before = now;
+        let felt = self.session.tissue().tool_contact(TOOL as usize);
+        let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
+        if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.before, now) {
+            self.own_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
         }
+        self.before = now;
     }
 
     /// Returns whether a tick's steps take more than their limit.
@@ -205,10 +201,10 @@ impl Predictor for TissueCopy {
         }
         self.step_to(now_s, place_m, others)?;
         let felt = self.session.tissue().tool_contact(TOOL as usize);
-        let others_work_j = self.others_work_j;
+        let own_work_j = self.own_work_j;
         let (force_n, contact_state) =
             felt.map_or((DVec3::ZERO, ContactState::Free), |feel| (feel.force_on_tool_n, feel.contact_state));
-        Some(Predicted { force_n, contact_state, others_work_j })
+        Some(Predicted { force_n, contact_state, own_work_j })
     }
 }
 
@@ -275,10 +271,10 @@ mod tests {
     }
 
     #[test]
-    fn a_copy_feels_the_other_tools_as_a_session_does_and_counts_their_work() {
+    fn a_copy_feels_the_other_tools_as_a_session_does_and_counts_its_work() {
         let model = model();
         let (mut session, mut copy) = (Session::new(&model), TissueCopy::new(&model, Tip::default()));
-        let (mut most_j, mut alone) = (0.0_f64, TissueCopy::new(&model, Tip::default()));
+        let (mut least_j, mut most_j, mut alone) = (0.0_f64, 0.0_f64, TissueCopy::new(&model, Tip::default()));
         let mut apart_n = 0.0_f64;
         for tick in 0..400 {
             let mut due = vec![led(0, place_m(tick), Tip::default())];
@@ -292,13 +288,37 @@ mod tests {
             let others: Vec<_> = other(tick).into_iter().collect();
             let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick), &others).unwrap();
             assert_eq!(felt.force_n, truth_n, "{tick}");
-            most_j = most_j.max(felt.others_work_j);
+            (least_j, most_j) = (least_j.min(felt.own_work_j), most_j.max(felt.own_work_j));
             let alone_n = alone.feel(f64::from(tick) * TICK_S, place_m(tick), &[]).unwrap().force_n;
             apart_n = apart_n.max(alone_n.distance(truth_n));
         }
-        // The other tool matters, and gives the tissue the work of a press of some millimetres.
+        // The other tool matters, and this one gives the tissue the work of a press of some millimetres.
         assert!(apart_n > 1e-3, "{apart_n} N");
-        assert!((1e-6..1e-2).contains(&most_j), "{most_j} J");
+        assert!((1e-6..1e-2).contains(&most_j) && least_j > -1e-9, "{least_j} to {most_j} J");
+    }
+
+    /// A tool goes down where another one has pushed the tissue away. That one lifts, the tissue comes back and pushes the tool
+    /// out again: with more force than it went down against.
+    #[test]
+    fn a_tool_that_another_one_pushes_gets_energy_from_the_copy() {
+        let text = palpate_tissue::scene::BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1;
+        let model = Model::parse("liver", text, &[]).unwrap();
+        let mut copy = TissueCopy::new(&model, Tip::default());
+        let depth_m = |tick: u32, begins: [u32; 2]| {
+            let passed = |from: u32| f64::from(tick.saturating_sub(from).min(100)) / 100.0;
+            passed(begins[0]) - passed(begins[1])
+        };
+        let (mut gave_j, mut gets_j) = (0.0_f64, 0.0);
+        for tick in 0..500 {
+            let time_s = f64::from(tick) * TICK_S;
+            let place_m = DVec3::new(0.035, 0.0375, 0.001 - 0.003 * depth_m(tick, [100, 300]));
+            let beside_m = DVec3::new(0.041, 0.0375, 0.001 - 0.007 * depth_m(tick, [0, 200]));
+            let motion = MotionState { time_s, place_m: beside_m, velocity_m_per_s: DVec3::ZERO };
+            let felt = copy.feel(time_s, place_m, &[OtherTool { tool: 1, tip: Tip::default(), motion }]).unwrap();
+            gave_j = gave_j.max(felt.own_work_j);
+            gets_j = -felt.own_work_j;
+        }
+        assert!(gets_j > 1e-6 && gets_j > gave_j, "gave {gave_j} J, got {gets_j} J more");
     }
 
     #[test]
@@ -323,7 +343,7 @@ mod tests {
         ];
         for tick in 50..150 {
             let felt = copy.feel(f64::from(tick) * TICK_S, place_m, &others).unwrap();
-            assert!(felt.force_n.is_finite() && felt.others_work_j.is_finite());
+            assert!(felt.force_n.is_finite() && felt.own_work_j.is_finite());
         }
         let led_tools: Vec<u32> = copy.others.iter().flatten().map(|led_tool| led_tool.tool).collect();
         assert_eq!(led_tools, [7]);

@@ -153,7 +153,7 @@ mod tests {
     use super::*;
 
     fn pressed(place_m: DVec3) -> Predicted {
-        Predicted { force_n: -400.0 * place_m, contact_state: ContactState::Sticking, others_work_j: 0.0 }
+        Predicted { force_n: -400.0 * place_m, contact_state: ContactState::Sticking, own_work_j: 0.0 }
     }
 
     /// A spring.

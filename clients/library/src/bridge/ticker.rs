@@ -454,7 +454,7 @@ mod tests {
     impl Predictor for TellingCopy {
         fn feel(&mut self, _: f64, _: DVec3, others: &[OtherTool]) -> Option<Predicted> {
             self.0.write(|told| *told = others.to_vec());
-            Some(Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free, others_work_j: 0.0 })
+            Some(Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free, own_work_j: 0.0 })
         }
     }
 

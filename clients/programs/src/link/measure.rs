@@ -164,12 +164,12 @@ impl Totals {
         Totals { outages: Some(outages), ..Totals::default() }
     }
 
-    /// Counts the tool's movement to `place_m` under the force of the last tick. `second_work_j` is the work that a second tool
-    /// has done on the true tissue so far: that energy may leave the port.
-    pub(super) fn moved(&mut self, place_m: DVec3, second_work_j: f64) {
+    /// Counts the tool's movement to `place_m` under the force of the last tick. `supplied_j` is the energy that a second
+    /// tool has given to a tool there through the true tissue so far: that may leave the port.
+    pub(super) fn moved(&mut self, place_m: DVec3, supplied_j: f64) {
         if let Some(before_m) = self.before.replace(place_m) {
             self.energy_j -= self.force_n.dot(place_m - before_m);
-            self.outcome.energy_min_j = self.outcome.energy_min_j.min(self.energy_j + second_work_j);
+            self.outcome.energy_min_j = self.outcome.energy_min_j.min(self.energy_j + supplied_j);
         }
     }
 

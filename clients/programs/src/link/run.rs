@@ -68,7 +68,7 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
     for tick in 0..ticks(*duration_s) {
         let now_s = f64::from(tick) * TICK_S;
         let place_m = held.place_m;
-        totals.moved(place_m, twin.second_work_j());
+        totals.moved(place_m, twin.supplied_j());
         if totals.is_unstable() || (place_m - task.start_m()).length() > UNSTABLE_AMPLITUDES * task.amplitude_m {
             totals.outcome.unstable_at_s = Some(now_s);
             break;

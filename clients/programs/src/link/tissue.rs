@@ -37,9 +37,9 @@ pub(super) struct LinkTissue {
     spot: Spot,
     /// The second tool, if the tissue leads it.
     pub(super) second: Option<Second>,
-    /// Place of the second tool, m, and the force on it, N, after the last step; and the work that it has done so far, J.
-    second_before: Option<(DVec3, DVec3)>,
-    second_work_j: f64,
+    /// Place of the hand's tool, m, and the force on it, N, after the last step; and the work that it has done so far, J.
+    before: Option<(DVec3, DVec3)>,
+    own_work_j: f64,
     change: Option<(f64, Arc<Model>)>,
 }
 
@@ -85,8 +85,8 @@ impl LinkTissue {
             tip: setup.tip,
             spot: setup.spot,
             second: Second::of(setup),
-            second_before: None,
-            second_work_j: 0.0,
+            before: None,
+            own_work_j: 0.0,
             change: setup.change.as_ref().map(|change| (change.at_s, change.model.clone())),
         })
     }
@@ -96,9 +96,10 @@ impl LinkTissue {
         &self.simulation.session
     }
 
-    /// Returns the work that the second tool has done on the tissue so far, J.
-    pub(super) fn second_work_j(&self) -> f64 {
-        self.second_work_j
+    /// Returns the energy that the second tool has given to the hand's through the tissue so far, J: what that got from the
+    /// tissue beyond what it gave.
+    pub(super) fn supplied_j(&self) -> f64 {
+        (-self.own_work_j).max(0.0)
     }
 
     /// Returns a command that moves the tool to a place in the hand's frame. A client time of 0 means at once.
@@ -139,12 +140,12 @@ impl LinkTissue {
                 self.simulation.apply(Input::Tissue(model));
             }
             self.simulation.step(ns(begin_s)).map_err(|refusal| refusal.to_string())?;
-            let felt = self.session().tissue().tool_contact(SECOND_TOOL as usize);
+            let felt = self.session().tissue().tool_contact(TOOL as usize);
             let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
-            if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.second_before, now) {
-                self.second_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
+            if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.before, now) {
+                self.own_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
             }
-            self.second_before = now;
+            self.before = now;
             if let Some(reason) = self.session().fault() {
                 return Err(reason);
             }
