@@ -20,12 +20,13 @@ use palpate_geometry::{Group, TriangleMesh};
 use palpate_haptics::{
     Device, Envelope, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Law, Renderer, Tip,
 };
-use palpate_proto::{datagram as of_touch, pb, touch};
+use palpate_proto::{datagram as of_touch, instrument, pb, touch};
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};
 use palpate_session::intake::Intake;
 use palpate_session::journal::records::{self, Chunk};
 use palpate_session::journal::{JournalReader, Replay, Topic, message as of_journal, pb as journal_pb};
+use palpate_session::led_instrument::LedInstrument;
 use palpate_session::sample_selection::Sampler;
 use palpate_session::snapshot::{self, Saved};
 use palpate_session::surface::Refinement;
@@ -225,7 +226,10 @@ fn open(open: &pb::TouchOpen) -> bool {
         assert!(tip.radius_m.is_finite() && tip.friction.is_finite());
     }
     let taken = sampling.map(|sampling| Sampler::new(sampling, 1000.0).next_due(7));
-    held && taken.is_ok() && device.is_none_or(|device| device.is_ok())
+    let instruments = open.instruments.iter().map(|message| instrument::from_instrument("instruments[0]", message));
+    held && taken.is_ok()
+        && instruments.into_iter().all(|read| read.is_ok())
+        && device.is_none_or(|device| device.is_ok())
 }
 
 /// The smallest closed mesh.
@@ -247,22 +251,34 @@ fn ball() -> &'static MeshShape {
     &SHAPE.get_or_init(made).shape
 }
 
+/// Reads a command: to a tool, or to the grasper.
+fn commands_of(message: &pb::Command, shape: &dyn RestShape) -> Result<Vec<Command>, String> {
+    let Some(pb::command::Action::Instrument(pose)) = &message.action else {
+        let read = wire::command::from_command(message, shape, 1).map(|command| vec![command]);
+        return read.map_err(|refusal| refusal.to_string());
+    };
+    let (pose, velocity) = instrument::from_pose(pose, true).map_err(|refusal| refusal.to_string())?;
+    let instrument = instrument::from_instrument("instruments[0]", &grasper()).expect("it is sound");
+    let grasper = LedInstrument::new(instrument, 0);
+    let command = wire::command::with_action(message, Action::Release, 1);
+    Ok(grasper.lead(&command, &pose, velocity.as_ref(), shape))
+}
+
 /// Submits all of them to one session, all or none, and does two steps after them.
 fn command_all(messages: &[pb::Command]) -> bool {
     let scene = &model().scene;
-    let on_mesh: Vec<_> = messages.iter().map(|message| wire::command::from_command(message, ball(), 1)).collect();
+    let on_mesh: Vec<_> = messages.iter().map(|message| commands_of(message, ball())).collect();
     let fit_mesh = on_mesh.iter().all(Result::is_ok);
-    for command in on_mesh.into_iter().flatten() {
+    for command in on_mesh.into_iter().flatten().flatten() {
         if let Action::Push(poke) = command.action {
             assert!(poke.centre_m.is_finite(), "{poke:?}");
         }
     }
     let mut intake = Intake::new(scene, &limits());
     intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
-    let commands: Result<Vec<_>, _> =
-        messages.iter().map(|message| wire::command::from_command(message, scene.shape(), 1)).collect();
+    let commands: Result<Vec<_>, _> = messages.iter().map(|message| commands_of(message, scene.shape())).collect();
     let Ok(commands) = commands else { return fit_mesh };
-    if intake.submit(1, commands, 1).is_err() {
+    if intake.submit(1, commands.concat(), 1).is_err() {
         return false;
     }
     let mut session = Session::new(model());
@@ -286,7 +302,7 @@ fn grasper() -> pb::Instrument {
         tip(DVec3::ZERO, InstrumentPart::UpperJaw),
         tip(DVec3::ZERO, InstrumentPart::LowerJaw),
     ];
-    palpate_proto::instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X }, 0)
+    instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X }, 0)
 }
 
 fn request_seeds() -> Vec<Vec<u8>> {
@@ -316,12 +332,12 @@ fn request_seeds() -> Vec<Vec<u8>> {
             shape: pb::TipShape::Disc.into(),
         }),
     });
-    let instrument = pb::command::Action::Instrument(palpate_proto::instrument::pose(&InstrumentPose {
+    let grasper_pose = pb::command::Action::Instrument(instrument::pose(&InstrumentPose {
         place_m: DVec3::new(0.1, 0.1, 0.01),
         orientation: DQuat::IDENTITY,
         jaw_rad: 0.4,
     }));
-    let actions = [force, position, pose, instrument, pb::command::Action::Release(pb::Release {})];
+    let actions = [force, position, pose, grasper_pose, pb::command::Action::Release(pb::Release {})];
     let command = |index: usize| pb::Command {
         tool: index as u32 % 3,
         sequence: Some(index as u64 + 1),

@@ -24,19 +24,18 @@ pub(super) fn instruments(open: &pb::TouchOpen, shape: &dyn RestShape) -> Result
         for (number, tip) in instrument.tips.iter().enumerate() {
             check_tip(&format!("{field}.tips[{number}].tip"), shape, &tip.tip)?;
         }
-        let tools = (message.first_tool..).take(instrument.tips.len());
-        for tool in tools.clone() {
-            let wrong = |message: String| Err(Refusal::new(Reason::OutOfRange, format!("{field}.first_tool"), message));
+        let wrong = |message: String| Err(Refusal::new(Reason::OutOfRange, format!("{field}.first_tool"), message));
+        let tips = u32::try_from(instrument.tips.len()).unwrap_or(u32::MAX);
+        let Some(end) = message.first_tool.checked_add(tips) else {
+            return wrong("is too large".to_owned());
+        };
+        for tool in message.first_tool..end {
             if !open.tools.contains(&tool) {
                 return wrong(format!("makes a tip of tool {tool}, which is not among the tools of the stream"));
             }
             if read.iter().any(|other| other.has(tool)) {
                 return wrong(format!("makes a tip of tool {tool}, which another instrument has"));
             }
-        }
-        // The numbers of tools end before those of 32 bits.
-        if tools.count() < instrument.tips.len() {
-            return Err(Refusal::new(Reason::OutOfRange, format!("{field}.first_tool"), "is too large"));
         }
         read.push(LedInstrument::new(instrument, message.first_tool));
     }
