@@ -19,7 +19,7 @@ const KEPT: usize = 512;
 
 /// An accepted pose.
 #[derive(Debug, Clone, Copy)]
-struct Accepted {
+struct AcceptedPose {
     sequence: u64,
     /// Time of the client, s, by which it is played; `None` if it acts at a step.
     client_time_s: Option<f64>,
@@ -32,7 +32,7 @@ struct Accepted {
 pub struct LedInstrument {
     instrument: Instrument,
     first_tool: u32,
-    poses: VecDeque<Accepted>,
+    poses: VecDeque<AcceptedPose>,
 }
 
 /// What an instrument felt at the end of a step.
@@ -113,7 +113,7 @@ impl LedInstrument {
         let by_time = command.client_time_ns != 0 && command.at_step.is_none();
         let client_time_s = by_time.then_some(command.client_time_ns as f64 * 1e-9);
         let (sequence, velocity) = (command.sequence.unwrap_or_default(), velocity.unwrap_or_default());
-        self.poses.push_back(Accepted { sequence, client_time_s, pose, velocity });
+        self.poses.push_back(AcceptedPose { sequence, client_time_s, pose, velocity });
     }
 
     /// Returns what the instrument felt by a sample of its tools; `None` before its first pose has acted, and after its release.
@@ -137,7 +137,7 @@ impl LedInstrument {
         if self.poses[newest].client_time_s.is_none() {
             return Some(self.poses[newest].pose);
         }
-        let by_time = |accepted: &Accepted| accepted.client_time_s.is_some_and(|time_s| time_s <= client_time_s);
+        let by_time = |accepted: &AcceptedPose| accepted.client_time_s.is_some_and(|time_s| time_s <= client_time_s);
         // An older pose than those that are kept can't be told.
         let before = &self.poses[self.poses.iter().rposition(by_time).unwrap_or(0)];
         let passed_s = client_time_s - before.client_time_s?;

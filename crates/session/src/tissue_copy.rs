@@ -11,11 +11,11 @@ use super::Session;
 use super::command::{Command, Due};
 use super::rules::Rules;
 use palpate_refusal::{Result, legible, number};
-use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
+use palpate_tissue::{Model, ToolContact};
 
 /// Number of the client's tool in the copy. Other tools have the following ones.
 const TOOL: u32 = 0;
@@ -32,6 +32,27 @@ const TICK_S: f64 = 1e-3;
 
 /// Time behind the client's above which a copy skips to the present, s: the client has paused.
 const MAX_BEHIND_S: f64 = 0.005;
+
+/// The work that a tool which is led by poses has done on a tissue.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ToolWork {
+    /// Place of the tool, m, and the force on it, N, after the last step.
+    before: Option<(DVec3, DVec3)>,
+    /// The work so far, J: negative if the tool got more energy than it gave.
+    pub done_j: f64,
+}
+
+impl ToolWork {
+    /// Adds the work of a step, after which `contact` is what the tool feels: the mean of the forces before and after it times
+    /// the way.
+    pub fn add(&mut self, contact: Option<ToolContact>) {
+        let now = contact.map(|felt| (felt.place_m, felt.force_on_tool_n));
+        if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.before, now) {
+            self.done_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
+        }
+        self.before = now;
+    }
+}
 
 /// Another tool on a copy.
 #[derive(Debug, Clone, Copy)]
@@ -58,9 +79,8 @@ pub struct TissueCopy {
     tip: Tip,
     /// The other tools on the copy.
     others: [Option<LedTool>; MAX_OTHERS],
-    /// Place of the client's tool, m, and the force on it, N, after the last step; and the work that it has done so far, J.
-    before: Option<(DVec3, DVec3)>,
-    own_work_j: f64,
+    /// The work of the client's tool.
+    work: ToolWork,
     due: Vec<Due>,
     /// The client's time minus the copy's, s; `None` before the first tick.
     ahead_s: Option<f64>,
@@ -77,8 +97,7 @@ impl TissueCopy {
             rules: Rules::new(&model.scene, &Limits::default()),
             tip,
             others: [None; MAX_OTHERS],
-            before: None,
-            own_work_j: 0.0,
+            work: ToolWork::default(),
             due: Vec::with_capacity(1 + 2 * MAX_OTHERS),
             ahead_s: None,
             place_m: DVec3::ZERO,
@@ -128,7 +147,7 @@ impl TissueCopy {
             self.due.push(led(TOOL, on_way_m, self.tip));
             self.lead_others(now_s - f64::from(steps - step) * step_s, others);
             self.session.advance(&mut self.due, |_| {});
-            self.count_work();
+            self.work.add(self.session.tissue().tool_contact(TOOL as usize));
         }
         if steps > 0 {
             self.place_m = place_m;
@@ -158,16 +177,6 @@ impl TissueCopy {
             self.others[slot] = Some(LedTool { tool: other.tool, tip: other.tip });
             self.due.push(due);
         }
-    }
-
-    /// Adds the work that the client's tool did in the last step: the mean of the forces before and after it times the way.
-    fn count_work(&mut self) {
-        let felt = self.session.tissue().tool_contact(TOOL as usize);
-        let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
-        if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.before, now) {
-            self.own_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
-        }
-        self.before = now;
     }
 
     /// Returns whether a tick's steps take more than their limit.
@@ -201,7 +210,7 @@ impl Predictor for TissueCopy {
         }
         self.step_to(now_s, place_m, others)?;
         let felt = self.session.tissue().tool_contact(TOOL as usize);
-        let own_work_j = self.own_work_j;
+        let own_work_j = self.work.done_j;
         let (force_n, contact_state) =
             felt.map_or((DVec3::ZERO, ContactState::Free), |feel| (feel.force_on_tool_n, feel.contact_state));
         Some(Predicted { force_n, contact_state, own_work_j })

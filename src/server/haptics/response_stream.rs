@@ -8,13 +8,14 @@ use palpate_proto::pb;
 use tonic::Status;
 
 use super::event::StreamEvent;
-use super::instruments::Instruments;
+use super::instruments::{Instruments, message};
 use crate::server::datagrams::DatagramChannel;
 use crate::server::force_law::Updates;
 use crate::server::recovered::Notices;
 use palpate_realtime::StreamGuard;
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::queue::Reader;
+use palpate_session::led_instrument::LedInstrument;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
 use palpate_tissue::lock::lock;
@@ -105,8 +106,8 @@ impl ResponseStream {
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
             let mut sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
-            let felt = lock(&self.instruments).iter().filter_map(|led| led.sample(&paced.sample)).collect::<Vec<_>>();
-            sample.instruments = felt.iter().map(super::instruments::message).collect();
+            let felt = |instrument: &LedInstrument| Some(message(&instrument.sample(&paced.sample)?));
+            sample.instruments = lock(&self.instruments).iter().filter_map(felt).collect();
             // The stream has a heartbeat of its own, which shows a client that it still works.
             let (now, by_datagram) = (now_ns(), self.channel.send(&sample));
             if !by_datagram || now.saturating_sub(self.streamed_ns) >= HEARTBEAT_NS {

@@ -11,6 +11,7 @@ use palpate_session::command::Command;
 use palpate_session::input::Input;
 use palpate_session::lease::LeaseId;
 use palpate_session::simulation::Simulation;
+use palpate_session::tissue_copy::ToolWork;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
 use palpate_tissue::Model;
@@ -37,9 +38,8 @@ pub(super) struct LinkTissue {
     spot: Spot,
     /// The second tool, if the tissue leads it.
     pub(super) second: Option<Second>,
-    /// Place of the hand's tool, m, and the force on it, N, after the last step; and the work that it has done so far, J.
-    before: Option<(DVec3, DVec3)>,
-    own_work_j: f64,
+    /// The work of the hand's tool.
+    work: ToolWork,
     change: Option<(f64, Arc<Model>)>,
 }
 
@@ -85,8 +85,7 @@ impl LinkTissue {
             tip: setup.tip,
             spot: setup.spot,
             second: Second::of(setup),
-            before: None,
-            own_work_j: 0.0,
+            work: ToolWork::default(),
             change: setup.change.as_ref().map(|change| (change.at_s, change.model.clone())),
         })
     }
@@ -99,7 +98,7 @@ impl LinkTissue {
     /// Returns the energy that the second tool has given to the hand's through the tissue so far, J: what that got from the
     /// tissue beyond what it gave.
     pub(super) fn supplied_j(&self) -> f64 {
-        (-self.own_work_j).max(0.0)
+        (-self.work.done_j).max(0.0)
     }
 
     /// Returns a command that moves the tool to a place in the hand's frame. A client time of 0 means at once.
@@ -140,12 +139,8 @@ impl LinkTissue {
                 self.simulation.apply(Input::Tissue(model));
             }
             self.simulation.step(ns(begin_s)).map_err(|refusal| refusal.to_string())?;
-            let felt = self.session().tissue().tool_contact(TOOL as usize);
-            let now = felt.map(|felt| (felt.place_m, felt.force_on_tool_n));
-            if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.before, now) {
-                self.own_work_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
-            }
-            self.before = now;
+            let contact = self.session().tissue().tool_contact(TOOL as usize);
+            self.work.add(contact);
             if let Some(reason) = self.session().fault() {
                 return Err(reason);
             }
