@@ -163,6 +163,40 @@ fn jaws_lift_what_is_between_them_by_friction_and_slip_without_it() {
     assert!(last(&slips).force_on_tool_n[2] > held.force_on_tool_n[2] / 3.0, "{:?}", last(&slips));
 }
 
+/// A shaft through a port presses and sweeps. Between its poses the script would lead it past the port.
+#[test]
+fn a_shaft_stays_in_its_port_whose_reaction_balances_the_wrench() {
+    let model = block();
+    let port_m = DVec3::new(0.02, 0.03, 0.12);
+    let text = "duration_s = 0.6\nsample_every_s = 0.01\n[[instrument]]\n\
+        shaft = { length_m = 0.02, radius_m = 0.004, friction = 0.4 }\n\
+        port = { place_m = [0.02, 0.03, 0.12], handle_m = 0.3 }\n\
+        poses = [{ at_s = 0, place_m = [0.03, 0.03, 0.036] }, { at_s = 0.2, place_m = [0.03, 0.03, 0.031] },\n\
+        { at_s = 0.5, place_m = [0.04, 0.036, 0.031], orientation = [0, 0, 1, 0] }]\n";
+    let (records, _) = played(&model, text);
+    let mut pressed_n = 0.0_f64;
+    for record in &records {
+        let [felt] = record.instruments[..] else { panic!("{record:?}") };
+        let place_m = DVec3::from(felt.place_m);
+        let [w, x, y, z] = felt.orientation;
+        let axis = DQuat::from_xyzw(x, y, z, w) * DVec3::X;
+        assert!((port_m - place_m).cross(axis).length() < 1e-12, "{felt:?}");
+        for tool in &record.tools {
+            let apart_m = (DVec3::from(tool.place_m) - port_m).cross(axis).length();
+            assert!(apart_m < 1e-9, "{apart_m} m");
+        }
+        let load = felt.in_port.unwrap();
+        let [port_n, hand_n, hand_n_m] =
+            [load.force_of_port_n, load.force_on_hand_n, load.torque_on_hand_n_m].map(DVec3::from);
+        let (force_n, torque_n_m) = (DVec3::from(felt.force_on_tool_n), DVec3::from(felt.torque_on_tool_n_m));
+        assert!((force_n + port_n).distance(hand_n) < 1e-12, "{felt:?}");
+        let about_m = torque_n_m + (port_m - place_m).cross(port_n) - (-0.3 * axis).cross(hand_n) - hand_n_m;
+        assert!(about_m.length() < 1e-12 && port_n.dot(axis).abs() < 1e-12, "{about_m} {felt:?}");
+        pressed_n = pressed_n.max(port_n.length());
+    }
+    assert!(pressed_n > 0.05, "{pressed_n} N");
+}
+
 #[test]
 fn instruments_that_nothing_can_be_are_refused_with_their_place() {
     let model = block();
@@ -199,6 +233,21 @@ fn instruments_that_nothing_can_be_are_refused_with_their_place() {
             "instrument[0].tips[0].grasps: is for a [[tool]]",
         ),
         (of(&format!("tips = [{{ radius_m = 0.0001 }}]\n{pose}")), "instrument[0].tips[0].radius_m: must be at least"),
+        (
+            of(&format!("{tip}\nport = {{ place_m = [0.03, 0.03, 0.05] }}\n{pose}")),
+            "instrument[0].poses[0].place_m: must be from 0.001 to 0.329 m from the port",
+        ),
+        (
+            of(&format!(
+                "{tip}\nport = {{ place_m = [0.03, 0.03, 0.04] }}\nposes = [{{ at_s = 0, place_m = [0.02, 0.03, 0.04] }}, \
+                 {{ at_s = 1, place_m = [0.04, 0.03, 0.04] }}]"
+            )),
+            "instrument[0].poses[1].place_m: must be at least 0.001 m from the port on the way from the pose before",
+        ),
+        (
+            of(&format!("{tip}\nport = {{ place_m = [0.03, 0.03, 0.1], handle_m = 3 }}\n{pose}")),
+            "instrument[0].port.handle_m: must be from 0.01 to 2",
+        ),
         (
             of(&format!("{tip}\nposes = [{{ at_s = 0, place_m = [0, 0, 9] }}]")),
             "instrument[0].poses[0].place_m: must be at most",

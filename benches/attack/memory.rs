@@ -29,6 +29,7 @@ pub async fn lease(door: &Door, session_id: &str, tool: u32) -> Result<String, S
         lease_s: Some(60.0),
         holder: "siege".into(),
         outlives_connection: false,
+        more_tools: Vec::new(),
     };
     Ok(haptics(door).acquire_tool(request).await?.into_inner().lease_id)
 }

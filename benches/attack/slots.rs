@@ -96,6 +96,7 @@ pub async fn kept_leases(ground: &Ground) -> Result<(), Status> {
             lease_s: Some(600.0),
             holder: "kept".into(),
             outlives_connection: true,
+            more_tools: Vec::new(),
         };
         ground.heard(haptics(&door).acquire_tool(request).await).inspect(|_| ground.strike());
     }

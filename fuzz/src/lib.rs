@@ -18,7 +18,7 @@ use palpate::server::config::Config;
 use palpate::server::identity::{self, KnownCallers, Role};
 use palpate_geometry::{Group, TriangleMesh};
 use palpate_haptics::{
-    Device, Envelope, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Law, Renderer, Tip,
+    Device, Envelope, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Law, Port, Renderer, Tip,
 };
 use palpate_proto::{datagram as of_touch, instrument, pb, touch};
 use palpate_session::Session;
@@ -143,7 +143,8 @@ pub const REQUESTS: &[(&str, Taker)] = &[
     ("AcquireToolRequest", |bytes| {
         pb::AcquireToolRequest::decode(bytes).is_ok_and(|request| {
             let mut intake = Intake::new(&model().scene, &limits());
-            intake.acquire(&[request.tool], &request.holder, request.lease_s.unwrap_or(2.0), 1, 0).is_ok()
+            let tools: Vec<u32> = std::iter::once(request.tool).chain(request.more_tools).collect();
+            intake.acquire(&tools, &request.holder, request.lease_s.unwrap_or(2.0), 1, 0).is_ok()
         })
     }),
     ("WatchSamplesRequest", |bytes| {
@@ -257,8 +258,8 @@ fn commands_of(message: &pb::Command, shape: &dyn RestShape) -> Result<Vec<Comma
         let read = wire::command::from_command(message, shape, 1).map(|command| vec![command]);
         return read.map_err(|refusal| refusal.to_string());
     };
-    let (pose, velocity) = instrument::from_pose(pose, true).map_err(|refusal| refusal.to_string())?;
     let instrument = instrument::from_instrument("instruments[0]", &grasper()).expect("it is sound");
+    let (pose, velocity) = instrument::from_pose(pose, &instrument).map_err(|refusal| refusal.to_string())?;
     let grasper = LedInstrument::new(instrument, 0);
     let command = wire::command::with_action(message, Action::Release, 1);
     Ok(grasper.lead(&command, &pose, velocity.as_ref(), shape))
@@ -294,7 +295,7 @@ fn command_all(messages: &[pb::Command]) -> bool {
     true
 }
 
-/// A shaft and two jaws, whose tips are tools 0 to 2.
+/// A shaft in a port and two jaws, whose tips are tools 0 to 2.
 fn grasper() -> pb::Instrument {
     let tip = |offset_m, part| InstrumentTip { offset_m, tip: Tip { radius_m: 0.02, ..Tip::default() }, part };
     let tips = vec![
@@ -302,7 +303,8 @@ fn grasper() -> pb::Instrument {
         tip(DVec3::ZERO, InstrumentPart::UpperJaw),
         tip(DVec3::ZERO, InstrumentPart::LowerJaw),
     ];
-    instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X }, 0)
+    let port = Some(Port { place_m: DVec3::new(0.1, 0.1, 1.0), handle_m: 2.0 });
+    instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X, port }, 0)
 }
 
 fn request_seeds() -> Vec<Vec<u8>> {
@@ -448,7 +450,8 @@ fn request_seeds() -> Vec<Vec<u8>> {
         ),
         (
             "AcquireToolRequest",
-            pb::AcquireToolRequest { tool: 3, lease_s: Some(1.0), ..Default::default() }.encode_to_vec(),
+            pb::AcquireToolRequest { tool: 3, lease_s: Some(1.0), more_tools: vec![4, 0], ..Default::default() }
+                .encode_to_vec(),
         ),
         ("WatchSamplesRequest", watch.encode_to_vec()),
         ("ProbeRequest", pb::ProbeRequest { r#where: Some(points), ..Default::default() }.encode_to_vec()),

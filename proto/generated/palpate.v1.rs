@@ -379,6 +379,9 @@ pub struct Instrument {
     /// The hinge of the jaws, in the instrument's frame.
     #[prost(message, optional, tag = "3")]
     pub hinge_m: ::core::option::Option<Vector3>,
+    /// Absent: it moves freely.
+    #[prost(message, optional, tag = "4")]
+    pub port: ::core::option::Option<Port>,
 }
 impl ::prost::Name for Instrument {
     const NAME: &'static str = "Instrument";
@@ -388,6 +391,28 @@ impl ::prost::Name for Instrument {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Instrument".into()
+    }
+}
+/// A point through which an instrument's shaft, which runs along -x, slides and about which it turns: a trocar. Poses are
+/// then turned by the smallest angle to one whose shaft passes through it.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Port {
+    /// In the tissue's frame.
+    #[prost(message, optional, tag = "1")]
+    pub position_m: ::core::option::Option<Vector3>,
+    /// Distance along the shaft from the instrument's origin to its handle, m, 0.01 to 2. The origin may be 1 mm to
+    /// handle_m - 1 mm from the port.
+    #[prost(double, tag = "2")]
+    pub handle_m: f64,
+}
+impl ::prost::Name for Port {
+    const NAME: &'static str = "Port";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Port".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Port".into()
     }
 }
 /// A tip of an instrument.
@@ -1149,6 +1174,12 @@ pub struct InstrumentSample {
     /// without jaws.
     #[prost(double, optional, tag = "5")]
     pub opening_n_m: ::core::option::Option<f64>,
+    /// The orientation at this step.
+    #[prost(message, optional, tag = "6")]
+    pub orientation: ::core::option::Option<Quaternion>,
+    /// What keeps the instrument in balance in its port. Absent without a port.
+    #[prost(message, optional, tag = "7")]
+    pub port_load: ::core::option::Option<PortLoad>,
 }
 impl ::prost::Name for InstrumentSample {
     const NAME: &'static str = "InstrumentSample";
@@ -1158,6 +1189,29 @@ impl ::prost::Name for InstrumentSample {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.InstrumentSample".into()
+    }
+}
+/// What the port of an instrument and the hand at its handle exert.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct PortLoad {
+    /// The force of the port on the instrument, across its shaft; there is no friction.
+    #[prost(message, optional, tag = "1")]
+    pub force_of_port_n: ::core::option::Option<Vector3>,
+    /// The force of the instrument on the hand at its handle.
+    #[prost(message, optional, tag = "2")]
+    pub force_on_hand_n: ::core::option::Option<Vector3>,
+    /// The torque of the instrument on the hand, about the handle and along the shaft.
+    #[prost(message, optional, tag = "3")]
+    pub torque_on_hand_n_m: ::core::option::Option<Vector3>,
+}
+impl ::prost::Name for PortLoad {
+    const NAME: &'static str = "PortLoad";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.PortLoad".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.PortLoad".into()
     }
 }
 /// A tool of another stream at the end of a step.
@@ -1359,6 +1413,10 @@ pub struct AcquireToolRequest {
     /// Whether the lease continues when the connection over which it was acquired ends; else the tool is released then.
     #[prost(bool, tag = "5")]
     pub outlives_connection: bool,
+    /// Further tools of the same lease. All are acquired or none: a client that leads an instrument with `Pose` has one tool
+    /// for each tip, and sends the poses of all in one SendCommands or one datagram.
+    #[prost(uint32, repeated, tag = "6")]
+    pub more_tools: ::prost::alloc::vec::Vec<u32>,
 }
 impl ::prost::Name for AcquireToolRequest {
     const NAME: &'static str = "AcquireToolRequest";
@@ -1439,7 +1497,7 @@ impl ::prost::Name for SendCommandsRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SendCommandsResponse {
-    /// The newest sample of the tool.
+    /// The newest sample of the tools of the lease.
     #[prost(message, optional, tag = "1")]
     pub sample: ::core::option::Option<Sample>,
 }

@@ -1,19 +1,22 @@
 //! Conversion of instruments and their poses to messages and back.
 
 use glam::DQuat;
-use palpate_haptics::instrument::{MAX_JAW_RAD, MAX_TIPS};
-use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity};
+use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::instrument_pose::MAX_JAW_RAD;
+use palpate_haptics::port::HANDLE_M;
+use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Port};
 
 use crate::geometry::{from_vector, vector};
 use crate::pb;
 use crate::touch::{from_tip, tip};
-use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_refusal::{Reason, Refusal, Result, legible, number};
 
 /// Largest distance of a tip or a hinge from an instrument's origin, m.
 const MAX_OFFSET_M: f64 = 10.0;
 
 /// Largest distance of an instrument from the origin of the tissue's frame, m.
 const MAX_AWAY_M: f64 = 1e3;
+const AWAY_RANGE: &str = "at most 1000 m from the origin of the tissue's frame";
 
 /// Largest size of a velocity of an instrument, m/s and rad/s.
 const MAX_VELOCITY: f64 = 1e3;
@@ -22,7 +25,8 @@ const MAX_VELOCITY: f64 = 1e3;
 ///
 /// # Errors
 /// Refuses an instrument without tips or with more than [`MAX_TIPS`], a part or a shape that this program does not know, a tip
-/// that grasps or has a spring, and a place that is not finite or farther than 10 m from the origin.
+/// that grasps or has a spring, a place that is not finite or farther than 10 m from the origin, and a port that is farther than
+/// 1000 m away or has a handle at no possible distance.
 pub fn from_instrument(field: &str, message: &pb::Instrument) -> Result<Instrument> {
     let near = |field: &str, place_m: Option<&pb::Vector3>| {
         let place_m = from_vector(place_m);
@@ -56,7 +60,16 @@ pub fn from_instrument(field: &str, message: &pb::Instrument) -> Result<Instrume
     Ok(Instrument {
         tips: message.tips.iter().enumerate().map(tip_of).collect::<Result<_>>()?,
         hinge_m: near(&format!("{field}.hinge_m"), message.hinge_m.as_ref())?,
+        port: message.port.as_ref().map(|message| from_port(&format!("{field}.port"), message)).transpose()?,
     })
+}
+
+fn from_port(field: &str, message: &pb::Port) -> Result<Port> {
+    let place_m = from_vector(message.position_m.as_ref());
+    number(&format!("{field}.position_m"), place_m.length(), AWAY_RANGE, |away_m| away_m <= MAX_AWAY_M)?;
+    let range = format!("from {} to {}", HANDLE_M.start(), HANDLE_M.end());
+    let handle_m = number(&format!("{field}.handle_m"), message.handle_m, &range, |v| HANDLE_M.contains(&v))?;
+    Ok(Port { place_m, handle_m })
 }
 
 /// Converts an instrument to a message. Its first tip is the tool `first_tool`.
@@ -75,19 +88,27 @@ pub fn instrument(instrument: &Instrument, first_tool: u32) -> pb::Instrument {
         first_tool,
         tips: instrument.tips.iter().map(tip_of).collect(),
         hinge_m: vector(instrument.hinge_m),
+        port: instrument.port.map(|port| pb::Port { position_m: vector(port.place_m), handle_m: port.handle_m }),
     }
 }
 
-/// Returns the pose in a message, and its velocity if it has one. `has_jaws`: the instrument has jaws.
+/// Returns the pose of an instrument in a message, and its velocity if it has one.
 ///
 /// # Errors
-/// Refuses an absent position, or one that is not finite or farther than 1000 m away, an orientation whose length is not 1 (within 0.001), an angle of the jaws that is not from 0 to π,
-/// or not 0 without jaws, and a velocity that is not finite or above 1000 m/s or rad/s.
-pub fn from_pose(message: &pb::InstrumentPose, has_jaws: bool) -> Result<(InstrumentPose, Option<InstrumentVelocity>)> {
+/// Refuses an absent position, or one that is not finite, farther than 1000 m away or not possible in the instrument's port, an
+/// orientation whose length is not 1 (within 0.001), an angle of the jaws that is not from 0 to π, or not 0 without jaws, and a velocity that is not finite or above 1000 m/s or rad/s.
+pub fn from_pose(
+    message: &pb::InstrumentPose,
+    instrument: &Instrument,
+) -> Result<(InstrumentPose, Option<InstrumentVelocity>)> {
     let missing = || Refusal::new(Reason::Missing, "instrument.position_m", "is missing");
     let place_m = from_vector(Some(message.position_m.as_ref().ok_or_else(missing)?));
-    let range = format!("at most {MAX_AWAY_M} m from the origin of the tissue's frame");
-    number("instrument.position_m", place_m.length(), &range, |away_m| away_m <= MAX_AWAY_M)?;
+    number("instrument.position_m", place_m.length(), AWAY_RANGE, |away_m| away_m <= MAX_AWAY_M)?;
+    if let Some(port) = &instrument.port {
+        let depths_m = port.depths_m();
+        let range = format!("from {} to {} m from the port", legible(*depths_m.start()), legible(*depths_m.end()));
+        number("instrument.position_m", place_m.distance(port.place_m), &range, |depth_m| depths_m.contains(&depth_m))?;
+    }
     let orientation = message.orientation.as_ref().map_or(Ok(DQuat::IDENTITY), |turn| {
         let turn = DQuat::from_xyzw(turn.x, turn.y, turn.z, turn.w);
         number("instrument.orientation", turn.length(), "of length 1", |length| (length - 1.0).abs() <= 1e-3)?;
@@ -96,7 +117,7 @@ pub fn from_pose(message: &pb::InstrumentPose, has_jaws: bool) -> Result<(Instru
         Ok::<_, Refusal>(if is_unit { turn } else { turn.normalize() })
     })?;
     let jaw_rad = number("instrument.jaw_rad", message.jaw_rad, "from 0 to π", |v| (0.0..=MAX_JAW_RAD).contains(&v))?;
-    if !has_jaws && jaw_rad != 0.0 {
+    if !instrument.has_jaws() && jaw_rad != 0.0 {
         return Err(Refusal::new(Reason::WrongKind, "instrument.jaw_rad", "is for an instrument with jaws"));
     }
     let velocity = message.velocity_m_per_s.as_ref().map(|velocity| {
@@ -120,11 +141,16 @@ pub fn from_pose(message: &pb::InstrumentPose, has_jaws: bool) -> Result<(Instru
 
 /// Converts a pose to a message, without a velocity.
 pub fn pose(pose: &InstrumentPose) -> pb::InstrumentPose {
-    let [x, y, z, w] = pose.orientation.to_array();
     pb::InstrumentPose {
         position_m: vector(pose.place_m),
-        orientation: Some(pb::Quaternion { w, x, y, z }),
+        orientation: orientation(pose.orientation),
         jaw_rad: pose.jaw_rad,
         ..Default::default()
     }
+}
+
+/// Converts an orientation to a message.
+pub fn orientation(orientation: DQuat) -> Option<pb::Quaternion> {
+    let [x, y, z, w] = orientation.to_array();
+    Some(pb::Quaternion { w, x, y, z })
 }

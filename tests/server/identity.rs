@@ -703,7 +703,7 @@ async fn no_secret_gets_into_the_log_however_much_is_logged() {
     // Ended in good order it writes all that it has logged.
     assert!(Command::new("kill").args(["-TERM", &server.child.id().to_string()]).status().unwrap().success());
     let log = reading.join().unwrap();
-    assert!(log.contains("call refused") && log.contains("tool acquired"), "{log}");
+    assert!(log.contains("call refused") && log.contains("tools acquired"), "{log}");
     let inside = key.lines().nth(1).unwrap();
     for secret in [&*good, &wrong, &lease_id, inside] {
         assert!(!log.contains(secret), "the log has {secret}: {log}");

@@ -97,6 +97,7 @@ async fn a_session_that_was_told_negative_zeros_is_verified_and_outlives_a_kill(
             holder: "zero".to_owned(),
             lease_s: Some(10.0),
             outlives_connection: true,
+            more_tools: Vec::new(),
         };
         let lease_id = before.haptics().await.acquire_tool(acquire).await.unwrap().into_inner().lease_id;
         let request = pb::SendCommandsRequest { session_id: id.clone(), lease_id, commands: Vec::new() };

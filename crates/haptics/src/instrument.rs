@@ -9,13 +9,12 @@
 
 use glam::{DQuat, DVec3};
 
+use crate::instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
+use crate::port::{Port, PortLoad};
 use crate::tip::Tip;
 
 /// Largest number of tips of an instrument.
 pub const MAX_TIPS: usize = 64;
-
-/// Largest angle between jaws, rad.
-pub const MAX_JAW_RAD: f64 = std::f64::consts::PI;
 
 /// What of an instrument a tip belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -51,70 +50,6 @@ pub struct InstrumentTip {
     pub part: InstrumentPart,
 }
 
-/// Where an instrument is.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct InstrumentPose {
-    /// Place of the instrument's origin in the frame of the tissue at rest, m.
-    pub place_m: DVec3,
-    /// Turns vectors of the instrument's frame into the tissue's; of length 1.
-    pub orientation: DQuat,
-    /// The angle between the jaws, rad, 0 while they are closed.
-    pub jaw_rad: f64,
-}
-
-impl InstrumentPose {
-    /// Returns the pose at a `part`, 0 to 1, of the way to another: the place on a straight line, the orientation by the shorter turn
-    /// at constant angular velocity.
-    #[must_use]
-    pub fn towards(&self, other: &Self, part: f64) -> Self {
-        InstrumentPose {
-            place_m: self.place_m + (other.place_m - self.place_m) * part,
-            orientation: turned_towards(self.orientation, other.orientation, part),
-            jaw_rad: self.jaw_rad + (other.jaw_rad - self.jaw_rad) * part,
-        }
-    }
-}
-
-/// How fast an instrument moves.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct InstrumentVelocity {
-    /// Velocity of the instrument's origin, m/s.
-    pub velocity_m_per_s: DVec3,
-    /// Angular velocity, rad/s, in the tissue's frame.
-    pub angular_rad_per_s: DVec3,
-    /// Velocity of the angle between the jaws, rad/s.
-    pub jaw_rad_per_s: f64,
-}
-
-impl InstrumentVelocity {
-    /// Returns the pose after a time, s, at this velocity.
-    #[must_use]
-    pub fn after(&self, pose: &InstrumentPose, time_s: f64) -> InstrumentPose {
-        InstrumentPose {
-            place_m: pose.place_m + self.velocity_m_per_s * time_s,
-            orientation: turned(self.angular_rad_per_s * time_s, pose.orientation),
-            jaw_rad: (pose.jaw_rad + self.jaw_rad_per_s * time_s).clamp(0.0, MAX_JAW_RAD),
-        }
-    }
-}
-
-/// A force and a torque on an instrument, both of the tissue.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Wrench {
-    /// The force, N.
-    pub force_n: DVec3,
-    /// The torque about a stated point, N·m.
-    pub torque_n_m: DVec3,
-}
-
-impl Wrench {
-    /// Returns the same wrench with its torque about another point, which lies `by_m` (m) from the former one.
-    #[must_use]
-    pub fn about(&self, by_m: DVec3) -> Self {
-        Wrench { torque_n_m: self.torque_n_m - by_m.cross(self.force_n), ..*self }
-    }
-}
-
 /// A rigid set of tips, with or without jaws.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Instrument {
@@ -122,6 +57,8 @@ pub struct Instrument {
     pub tips: Vec<InstrumentTip>,
     /// The hinge of the jaws in the instrument's frame, m.
     pub hinge_m: DVec3,
+    /// The port through which its shaft slides; `None`: it moves freely.
+    pub port: Option<Port>,
 }
 
 impl Instrument {
@@ -132,6 +69,23 @@ impl Instrument {
         let gaps = ((from_m.distance(to_m) / tip.radius_m).ceil() as usize).clamp(1, MAX_TIPS);
         let offsets_m = (0..=gaps).map(|at| from_m.lerp(to_m, at as f64 / gaps as f64));
         self.tips.extend(offsets_m.map(|offset_m| InstrumentTip { offset_m, tip, part }));
+    }
+
+    /// Returns where the instrument is if a hand leads it to a pose: with a port, its shaft passes through that ([`Port::lead`]).
+    #[must_use]
+    pub fn lead(&self, pose: &InstrumentPose) -> InstrumentPose {
+        self.port.map_or(*pose, |port| port.lead(pose))
+    }
+
+    /// Returns the velocity at a pose of [`Instrument::lead`] if a hand leads it with a velocity.
+    #[must_use]
+    pub fn lead_velocity(&self, pose: &InstrumentPose, velocity: &InstrumentVelocity) -> InstrumentVelocity {
+        self.port.map_or(*velocity, |port| port.lead_velocity(pose, velocity))
+    }
+
+    /// Returns what port and hand exert at a pose of [`Instrument::lead`] and a wrench of the tissue; `None` without a port.
+    pub fn port_load(&self, pose: &InstrumentPose, wrench: &Wrench) -> Option<PortLoad> {
+        self.port.map(|port| port.load(pose, wrench))
     }
 
     /// Returns whether it has jaws.
@@ -183,32 +137,9 @@ impl Instrument {
     }
 }
 
-/// Cosine of half an angle from which on two orientations are so near that a straight line between them is exact to rounding.
-const NEARLY_EQUAL: f64 = 1.0 - 1e-12;
-
 /// Returns the rotation by an angle about z. (glam's own takes sine and cosine from the system, whose last digits differ.)
 fn about_z(angle_rad: f64) -> DQuat {
     DQuat::from_xyzw(0.0, 0.0, libm::sin(0.5 * angle_rad), libm::cos(0.5 * angle_rad))
-}
-
-/// Returns an orientation after a turn by a vector of angles, rad, with the same bits on every system.
-fn turned(by_rad: DVec3, orientation: DQuat) -> DQuat {
-    let angle_rad = by_rad.length();
-    let Some(axis) = by_rad.try_normalize() else { return orientation };
-    let DVec3 { x, y, z } = axis * libm::sin(0.5 * angle_rad);
-    (DQuat::from_xyzw(x, y, z, libm::cos(0.5 * angle_rad)) * orientation).normalize()
-}
-
-/// Returns the orientation at a part of the shorter turn from one to another, with the same bits on every system.
-fn turned_towards(from: DQuat, to: DQuat, part: f64) -> DQuat {
-    let cosine = from.dot(to);
-    let (to, cosine) = if cosine < 0.0 { (-to, -cosine) } else { (to, cosine) };
-    if cosine > NEARLY_EQUAL {
-        return (from * (1.0 - part) + to * part).normalize();
-    }
-    let angle_rad = libm::acos(cosine);
-    let weight = |part: f64| libm::sin(part * angle_rad);
-    (from * weight(1.0 - part) + to * weight(part)).normalize()
 }
 
 #[cfg(test)]
@@ -277,14 +208,5 @@ mod tests {
         let there = Wrench { force_n, torque_n_m }.about(by_m);
         let power_w = there.force_n.dot(velocity + rotation.cross(by_m)) + there.torque_n_m.dot(rotation);
         assert!((power_w - (expected_w - opening_n_m * opening)).abs() < 1e-12, "{power_w}");
-    }
-
-    #[test]
-    fn half_of_the_way_turns_by_half_of_the_angle() {
-        let from = InstrumentPose { place_m: DVec3::ZERO, orientation: DQuat::IDENTITY, jaw_rad: 0.0 };
-        let to = InstrumentPose { place_m: DVec3::X, orientation: -DQuat::from_rotation_z(1.0), jaw_rad: 0.5 };
-        let half = from.towards(&to, 0.5);
-        assert!(half.orientation.angle_between(DQuat::from_rotation_z(0.5)) < 1e-7);
-        assert_eq!((half.place_m, half.jaw_rad), (0.5 * DVec3::X, 0.25));
     }
 }

@@ -5,9 +5,9 @@
 
 use std::collections::VecDeque;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use palpate_haptics::pose_playback::EXTRAPOLATE_S;
-use palpate_haptics::{Instrument, InstrumentPose, InstrumentVelocity, Wrench};
+use palpate_haptics::{Instrument, InstrumentPose, InstrumentVelocity, PortLoad, Wrench};
 
 use super::Sample;
 use super::command::Command;
@@ -46,6 +46,10 @@ pub struct InstrumentSample {
     pub wrench: Wrench,
     /// Torque with which the tissue opens the jaws, N·m; `None` without jaws.
     pub opening_n_m: Option<f64>,
+    /// The orientation of the instrument.
+    pub orientation: DQuat,
+    /// What its port and the hand exert; `None` without a port.
+    pub port_load: Option<PortLoad>,
 }
 
 impl LedInstrument {
@@ -83,15 +87,26 @@ impl LedInstrument {
         velocity: Option<&InstrumentVelocity>,
         shape: &dyn RestShape,
     ) -> Vec<Command> {
+        let (pose, velocity) = self.led(pose, velocity);
         self.each(command, |number| {
-            let (place_m, tip) = (self.instrument.tip_m(number, pose), self.instrument.tips[number].tip);
+            let (place_m, tip) = (self.instrument.tip_m(number, &pose), self.instrument.tips[number].tip);
             let velocity_m_per_s =
-                velocity.map(|velocity| self.instrument.tip_velocity_m_per_s(number, pose, velocity));
+                velocity.map(|velocity| self.instrument.tip_velocity_m_per_s(number, &pose, &velocity));
             match is_led(shape, place_m, tip.radius_m) {
                 true => Action::Pose { place_m, velocity_m_per_s, tip },
                 false => Action::Release,
             }
         })
+    }
+
+    /// Returns a pose and its velocity as the instrument's port leaves them.
+    fn led(
+        &self,
+        pose: &InstrumentPose,
+        velocity: Option<&InstrumentVelocity>,
+    ) -> (InstrumentPose, Option<InstrumentVelocity>) {
+        let pose = self.instrument.lead(pose);
+        (pose, velocity.map(|velocity| self.instrument.lead_velocity(&pose, velocity)))
     }
 
     /// Returns the commands that release the tips: `command` to each tool.
@@ -112,6 +127,7 @@ impl LedInstrument {
         }
         let by_time = command.client_time_ns != 0 && command.at_step.is_none();
         let client_time_s = by_time.then_some(command.client_time_ns as f64 * 1e-9);
+        let (pose, velocity) = self.led(&pose, velocity.as_ref());
         let (sequence, velocity) = (command.sequence.unwrap_or_default(), velocity.unwrap_or_default());
         self.poses.push_back(AcceptedPose { sequence, client_time_s, pose, velocity });
     }
@@ -120,12 +136,15 @@ impl LedInstrument {
     pub fn sample(&self, sample: &Sample) -> Option<InstrumentSample> {
         let tips = || sample.tools.iter().filter_map(|tool| Some((self.tip(tool.tool)?, tool)));
         let led = tips().find(|(_, tool)| tool.feel.is_some())?.1;
-        let pose = self.pose_at(led.acknowledged_sequence, led.place_time_s)?;
+        let pose = self.instrument.lead(&self.pose_at(led.acknowledged_sequence, led.place_time_s)?);
         let forces_n = || tips().filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n)));
+        let wrench = self.instrument.wrench(&pose, forces_n());
         Some(InstrumentSample {
             first_tool: self.first_tool,
             about_m: pose.place_m,
-            wrench: self.instrument.wrench(&pose, forces_n()),
+            orientation: pose.orientation,
+            wrench,
+            port_load: self.instrument.port_load(&pose, &wrench),
             opening_n_m: self.instrument.has_jaws().then(|| self.instrument.opening_n_m(&pose, forces_n())),
         })
     }

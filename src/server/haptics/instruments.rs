@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
+use palpate_haptics::PortLoad;
 use palpate_proto::{instrument, pb};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::led_instrument::{InstrumentSample, LedInstrument};
@@ -51,5 +52,11 @@ pub(super) fn message(sample: &InstrumentSample) -> pb::InstrumentSample {
         force_on_tool_n: vector(sample.wrench.force_n),
         torque_on_tool_n_m: vector(sample.wrench.torque_n_m),
         opening_n_m: sample.opening_n_m,
+        orientation: instrument::orientation(sample.orientation),
+        port_load: sample.port_load.map(|PortLoad { force_of_port_n, on_hand }| pb::PortLoad {
+            force_of_port_n: vector(force_of_port_n),
+            force_on_hand_n: vector(on_hand.force_n),
+            torque_on_hand_n_m: vector(on_hand.torque_n_m),
+        }),
     }
 }

@@ -146,7 +146,7 @@ impl LeaseController {
         let command = Command { sequence: Some(sequence), ..command };
         match &message.action {
             Some(Message::Instrument(pose)) => {
-                let (pose, velocity) = instrument::from_pose(pose, instrument.instrument().has_jaws())?;
+                let (pose, velocity) = instrument::from_pose(pose, instrument.instrument())?;
                 let commands = instrument.lead(&command, &pose, velocity.as_ref(), self.handle.model.shape());
                 let reached = |command| within_reach(command, &self.handle, self.device.as_ref());
                 let commands = commands.into_iter().map(reached).collect::<Result<Commands>>()?;

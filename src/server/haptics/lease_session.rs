@@ -48,7 +48,7 @@ pub(super) async fn offer(
     let guard = handle.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
     let (offer, arrival) = services.datagrams.offer()?.ok_or_else(not_available)?;
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    // A lease of AcquireTool is of one tool: it has no instruments.
+    // Tools of AcquireTool are led one by one: they are in no instrument.
     let instruments = Instruments::default();
     let controller =
         LeaseController::new(handle.clone(), lease, &tools, None, true, limits, traffic, instruments.clone());

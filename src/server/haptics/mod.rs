@@ -9,6 +9,7 @@ mod response_stream;
 mod stream;
 mod tools;
 
+use std::iter::once;
 use std::pin::Pin;
 
 use futures_util::stream::{Stream, unfold};
@@ -82,10 +83,11 @@ impl HapticService for Haptics {
             lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
         }
         let lease = random_bits()?;
-        let charges = charges(&account, 1).map_err(of_one_tool)?;
+        let tools: Vec<u32> = once(request.tool).chain(request.more_tools).collect();
+        let charges = charges(&account, tools.len()).map_err(of_one_tool)?;
         handle
             .at_intake(|intake, now| {
-                intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
+                intake.acquire(&tools, &request.holder, lease_s, lease, now)?;
                 intake.charge(lease, charges);
                 Ok::<_, Refusal>(())
             })
@@ -94,7 +96,7 @@ impl HapticService for Haptics {
             peer.leases.add(&handle, lease, None);
         }
         tenure.map_or(Ok(()), |tenure| tenure.bind(&handle, lease))?;
-        info!(session = %handle.id, tool = request.tool, holder = ?request.holder, "tool acquired");
+        info!(session = %handle.id, ?tools, holder = ?request.holder, "tools acquired");
         Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
     }
 

@@ -224,6 +224,39 @@ async fn a_tool_has_one_holder_until_it_is_let_go() {
 }
 
 #[tokio::test]
+async fn a_lease_of_several_tools_moves_all_of_them_in_one_call() {
+    let server = TestServer::start(&[]);
+    let session = server.paper(false).await;
+    let mut haptics = server.haptics().await;
+    let acquire = |more_tools: &[u32]| pb::AcquireToolRequest {
+        session_id: session.clone(),
+        tool: 2,
+        more_tools: more_tools.to_vec(),
+        ..Default::default()
+    };
+    // All or none: tool 2 is still free afterwards.
+    for (more_tools, expected) in [(&[3, 2][..], "names tool 2 twice"), (&[3, 64], "must be below 64")] {
+        let refused = haptics.acquire_tool(acquire(more_tools)).await.unwrap_err();
+        assert!(refused.message().contains(expected), "{refused}");
+    }
+    let lease = haptics.acquire_tool(acquire(&[5, 3])).await.unwrap().into_inner();
+    let refused = told(&haptics.acquire_tool(pb::AcquireToolRequest { tool: 5, ..acquire(&[]) }).await.unwrap_err());
+    assert_eq!((refused.1.as_str(), refused.2.as_str()), ("TOOL_HELD", "tool"));
+    let request = pb::SendCommandsRequest {
+        session_id: session.clone(),
+        lease_id: lease.lease_id.clone(),
+        commands: [2, 3, 5].map(|tool| force(tool, 1, -1.0)).to_vec(),
+    };
+    let sample = haptics.send_commands(request).await.unwrap().into_inner().sample.unwrap();
+    assert_eq!(sample.tools.iter().map(|tool| tool.tool).collect::<Vec<_>>(), [2, 3, 5]);
+    assert!(sample.tools.iter().all(|tool| tool.acknowledged_sequence == 1), "{sample:?}");
+    // The release of the lease releases all.
+    let release = pb::ReleaseToolRequest { session_id: session.clone(), lease_id: lease.lease_id };
+    haptics.release_tool(release).await.unwrap();
+    haptics.acquire_tool(acquire(&[5, 3])).await.unwrap();
+}
+
+#[tokio::test]
 async fn a_client_that_vanishes_leaves_no_force_behind() {
     let server = TestServer::start(&[]);
     let session = server.paper(false).await;

@@ -2,7 +2,7 @@
 
 use crate::common::server::{TestServer, TestTouch, open, told};
 use glam::{DQuat, DVec3};
-use palpate_haptics::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Tip};
+use palpate_haptics::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Port, Tip};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::pb::command::Action;
 use palpate_proto::{instrument, pb, touch};
@@ -27,13 +27,17 @@ fn pose_at(step: u64) -> InstrumentPose {
         jaw_rad: 0.8 * (1.0 - part),
     };
     // As the server reads it: rounding of the orientation is part of the bits.
-    instrument::from_pose(&instrument::pose(&pose), true).unwrap().0
+    instrument::from_pose(&instrument::pose(&pose), &grasper()).unwrap().0
 }
 
 const FIRST: u32 = 2;
 
 fn tools() -> Vec<u32> {
     (FIRST..FIRST + 11).collect()
+}
+
+fn port_at(place_m: DVec3, handle_m: f64) -> pb::Port {
+    pb::Port { position_m: vector(place_m), handle_m }
 }
 
 async fn liver(server: &TestServer) -> String {
@@ -146,6 +150,47 @@ async fn an_instrument_is_led_by_the_clients_time() {
     assert!(sum_n.distance(from_vector(sample.instruments[0].force_on_tool_n.as_ref())) < 1e-12 * sum_n.length());
 }
 
+/// The shaft of an instrument in a port passes through it at every step, also while the server goes on by velocities.
+#[tokio::test]
+async fn an_instrument_in_a_port_stays_in_it() {
+    let server = TestServer::start(&[]);
+    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
+    let request = pb::CreateSessionRequest { source, ..Default::default() };
+    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
+    let port = Port { place_m: DVec3::new(0.0375, 0.0375, 0.12), handle_m: 0.33 };
+    let shaft = Instrument { port: Some(port), ..grasper() };
+    let instruments = vec![instrument::instrument(&shaft, FIRST)];
+    let open = pb::TouchOpen { instruments, ..open(&session.session_id, &tools()) };
+    let mut touch = TestTouch::open(&server, open).await.unwrap();
+    let place_m =
+        |tick: u64| DVec3::new(0.0375 + 0.01 * (0.02 * tick as f64).sin(), 0.0375, 0.003 - 2e-5 * tick as f64);
+    // The first has an orientation with which the shaft would be beside the port.
+    for tick in 0..300_u64 {
+        let told = pb::InstrumentPose {
+            velocity_m_per_s: vector(1e3 * (place_m(tick + 1) - place_m(tick))),
+            ..instrument::pose(&InstrumentPose { place_m: place_m(tick), orientation: DQuat::IDENTITY, jaw_rad: 0.0 })
+        };
+        let client_time_ns = (1 + tick) * 1_000_000;
+        if tick % 10 == 0 {
+            touch.command(pb::Command { client_time_ns, at_step: None, ..command(tick, told) }).await;
+        }
+    }
+    let mut pressed_n = 0.0_f64;
+    while pressed_n < 0.05 {
+        let sample = touch.sample_with(|sample| !sample.instruments.is_empty()).await;
+        let felt = sample.instruments[0];
+        let about_m = from_vector(felt.about_m.as_ref());
+        let turn = felt.orientation.unwrap();
+        let axis = DQuat::from_xyzw(turn.x, turn.y, turn.z, turn.w) * DVec3::X;
+        assert!((about_m - port.place_m).cross(axis).length() < 1e-12, "{felt:?}");
+        let load = felt.port_load.unwrap();
+        let [tissue_n, port_n, hand_n] =
+            [felt.force_on_tool_n, load.force_of_port_n, load.force_on_hand_n].map(|n| from_vector(n.as_ref()));
+        assert!((tissue_n + port_n).distance(hand_n) < 1e-9, "{felt:?}");
+        pressed_n = pressed_n.max(port_n.length());
+    }
+}
+
 #[tokio::test]
 async fn what_is_wrong_with_an_instrument_is_named() {
     let server = TestServer::start(&[]);
@@ -176,6 +221,16 @@ async fn what_is_wrong_with_an_instrument_is_named() {
         (with(&|instrument| instrument.first_tool = 3), "OUT_OF_RANGE", "instruments[0].first_tool"),
         (with(&|instrument| instrument.first_tool = u32::MAX - 2), "OUT_OF_RANGE", "instruments[0].first_tool"),
         (twice, "OUT_OF_RANGE", "instruments[1].first_tool"),
+        (
+            with(&|instrument| instrument.port = Some(port_at(DVec3::Z, 3.0))),
+            "OUT_OF_RANGE",
+            "instruments[0].port.handle_m",
+        ),
+        (
+            with(&|instrument| instrument.port = Some(port_at(DVec3::NAN, 0.3))),
+            "NOT_FINITE",
+            "instruments[0].port.position_m",
+        ),
     ] {
         let refused = TestTouch::open(&server, open).await.err().unwrap();
         let (_, told_reason, told_field) = told(&refused);
@@ -222,9 +277,14 @@ async fn what_is_wrong_with_an_instrument_is_named() {
 #[test]
 fn an_instrument_is_read_as_it_was_written() {
     let told = InstrumentTip { offset_m: 0.02 * DVec3::Y, tip: Tip::default(), part: InstrumentPart::Body };
-    let grasper = Instrument { tips: [grasper().tips, vec![told]].concat(), ..grasper() };
+    let port = Some(Port { place_m: DVec3::new(0.04, 0.04, 0.2), handle_m: 0.3 });
+    let grasper = Instrument { tips: [grasper().tips, vec![told]].concat(), port, ..grasper() };
     assert_eq!(instrument::from_instrument("", &instrument::instrument(&grasper, 5)).unwrap(), grasper);
-    let (pose, velocity) = instrument::from_pose(&instrument::pose(&pose_at(100)), true).unwrap();
+    let (pose, velocity) = instrument::from_pose(&instrument::pose(&pose_at(100)), &grasper).unwrap();
     assert!(pose.orientation.angle_between(pose_at(100).orientation) < 1e-7 && velocity.is_none());
     assert_eq!((pose.place_m, pose.jaw_rad), (pose_at(100).place_m, pose_at(100).jaw_rad));
+    // At its port an instrument has no direction.
+    let there = InstrumentPose { place_m: DVec3::new(0.04, 0.04, 0.2005), ..pose };
+    let refusal = instrument::from_pose(&instrument::pose(&there), &grasper).unwrap_err();
+    assert!(refusal.to_string().contains("from 0.001 to 0.299 m from the port"), "{refusal}");
 }

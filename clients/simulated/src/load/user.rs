@@ -192,6 +192,7 @@ impl UserSession {
             holder: "palpate-client load".to_owned(),
             // The connection is silent until the commands have acted, and silent connections are closed.
             outlives_connection: true,
+            more_tools: Vec::new(),
         };
         let lease_id = haptics.acquire_tool(acquire).await?.into_inner().lease_id;
         let command = |index: u64| {

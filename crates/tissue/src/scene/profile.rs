@@ -244,7 +244,7 @@ pub struct InstrumentProfile {
     /// The instrument.
     pub instrument: Instrument,
     /// Times, s, and poses, by strictly ascending time; at least one. Between two of them the instrument moves with the profile of a
-    /// [`Move`] ([`InstrumentPose::towards`]); after the last it stays.
+    /// [`Move`] ([`InstrumentPose::towards`]); after the last it stays. With a port, its shaft passes through that.
     pub poses: Vec<(f64, InstrumentPose)>,
     /// Time at which it is taken away, s, later than the first pose; infinite if it stays.
     pub until_s: f64,
@@ -256,7 +256,7 @@ impl InstrumentProfile {
     /// Returns the pose at a time; `None` before the first pose and from `until_s` on.
     pub fn at(&self, time_s: f64) -> Option<InstrumentPose> {
         let (from, to) = reached(&self.poses, self.until_s, time_s)?;
-        Some(to.map_or(*from, |(to, part)| from.towards(to, part)))
+        Some(self.instrument.lead(&to.map_or(*from, |(to, part)| from.towards(to, part))))
     }
 }
 

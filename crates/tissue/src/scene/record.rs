@@ -134,6 +134,21 @@ pub struct InstrumentRecord {
     /// `None`, and not written, without jaws.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub opening_n_m: Option<f64>,
+    /// What its port and the hand that holds it exert; not written without a port.
+    #[serde(flatten)]
+    pub in_port: Option<PortRecord>,
+}
+
+/// What acts on an instrument in a port, so that it is in balance ([`palpate_haptics::port`]). Vectors are [x, y, z] in the tissue's
+/// frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PortRecord {
+    /// Force of the port on the instrument, N; across its shaft.
+    pub force_of_port_n: [f64; 3],
+    /// Force of the instrument on the hand at its handle, N.
+    pub force_on_hand_n: [f64; 3],
+    /// Torque of the instrument on the hand about its handle, N·m; along its shaft.
+    pub torque_on_hand_n_m: [f64; 3],
 }
 
 /// Energies of the whole tissue, J, at the end of a step.

@@ -8,8 +8,9 @@ use glam::DVec3;
 use super::Change;
 pub use super::action::Action;
 use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile};
-use super::record::{InstrumentRecord, ToolRecord};
+use super::record::{InstrumentRecord, PortRecord, ToolRecord};
 use crate::shape::{PointId, RestShape};
+use palpate_haptics::PortLoad;
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
 /// ([`made_for`](super::script_reader::made_for)).
@@ -140,6 +141,11 @@ impl Script {
                 torque_on_tool_n_m: array(wrench.torque_n_m),
                 jaw_rad: of_jaws(pose.jaw_rad),
                 opening_n_m: of_jaws(instrument.opening_n_m(&pose, forces_n())),
+                in_port: instrument.port_load(&pose, &wrench).map(|PortLoad { force_of_port_n, on_hand }| PortRecord {
+                    force_of_port_n: array(force_of_port_n),
+                    force_on_hand_n: array(on_hand.force_n),
+                    torque_on_hand_n_m: array(on_hand.torque_n_m),
+                }),
             })
         };
         self.instruments.iter().enumerate().filter_map(of).collect()

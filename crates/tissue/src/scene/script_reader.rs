@@ -5,8 +5,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec2, DVec3};
-use palpate_haptics::instrument::{MAX_JAW_RAD, MAX_TIPS};
-use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Tip, TipShape};
+use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::instrument_pose::MAX_JAW_RAD;
+use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
+use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Port, Tip, TipShape};
 
 use super::kind::TextKind;
 use super::profile::{
@@ -472,7 +474,7 @@ impl Binding<'_> {
     /// Reads an instrument, whose first tip is tool `first_tool`.
     fn instrument(&mut self, item: &Item<'_>, first_tool: usize) -> Result<InstrumentProfile> {
         item.table(|fields| {
-            let instrument = self.tips(item, fields)?;
+            let instrument = Instrument { port: self.port(fields)?, ..self.tips(item, fields)? };
             let list = fields.required("poses")?;
             let mut poses: Vec<(f64, InstrumentPose)> = Vec::new();
             for entry in list.list()? {
@@ -487,16 +489,35 @@ impl Binding<'_> {
                     }
                     let range = format!("from 0 to {MAX_JAW_RAD:.4}");
                     number(&fields.path("jaw_rad"), jaw_rad, &range, |v| (0.0..=MAX_JAW_RAD).contains(&v))?;
-                    let pose = InstrumentPose { place_m, orientation, jaw_rad };
+                    let asked = InstrumentPose { place_m, orientation, jaw_rad };
+                    if let Some(port) = &instrument.port {
+                        let before_m = poses.last().map_or(place_m, |pose| pose.1.place_m);
+                        check_way(&fields.path("place_m"), port, before_m, place_m)?;
+                    }
+                    let pose = instrument.lead(&asked);
                     for tip in 0..instrument.tips.len() {
                         let far_m = instrument.tip_m(tip, &pose).distance(self.scene.shape().extent().middle_m());
                         check_reach(&fields.path("place_m"), self.scene.shape(), far_m, self.limits)?;
                     }
-                    Ok((at_s, pose))
+                    Ok((at_s, asked))
                 })?);
             }
             let until_s = until(fields, &list, poses.first().map(|pose| pose.0))?;
             Ok(InstrumentProfile { instrument, poses, until_s, first_tool })
+        })
+    }
+
+    /// Reads the port of an instrument.
+    fn port(&self, fields: &mut Fields<'_>) -> Result<Option<Port>> {
+        let Some(port) = fields.item("port") else { return Ok(None) };
+        port.table(|fields| {
+            let place_m = fields.required("place_m")?.vector()?;
+            let far_m = place_m.distance(self.scene.shape().extent().middle_m());
+            check_reach(&fields.path("place_m"), self.scene.shape(), far_m, self.limits)?;
+            let handle_m = fields.number("handle_m")?.unwrap_or(DEFAULT_HANDLE_M);
+            let range = format!("from {} to {}", HANDLE_M.start(), HANDLE_M.end());
+            number(&fields.path("handle_m"), handle_m, &range, |v| HANDLE_M.contains(&v))?;
+            Ok(Some(Port { place_m, handle_m }))
         })
     }
 
@@ -611,10 +632,19 @@ fn mounted(profile: &Arc<InstrumentProfile>, number: usize) -> PoseProfile {
     let InstrumentProfile { instrument, poses, until_s, .. } = &**profile;
     PoseProfile {
         tip: instrument.tips[number].tip,
-        poses: poses.iter().map(|(at_s, pose)| (*at_s, instrument.tip_m(number, pose))).collect(),
+        poses: poses.iter().map(|(at_s, pose)| (*at_s, instrument.tip_m(number, &instrument.lead(pose)))).collect(),
         until_s: *until_s,
         mounted: Some((profile.clone(), number)),
     }
+}
+
+/// Refuses a place to which an instrument can't go in its port, and a way from the place before that passes the port.
+fn check_way(field: &str, port: &Port, from_m: DVec3, to_m: DVec3) -> Result<()> {
+    let (depths_m, depth_m) = (port.depths_m(), to_m.distance(port.place_m));
+    let [least, most] = [*depths_m.start(), *depths_m.end()].map(legible);
+    number(field, depth_m, &format!("from {least} to {most} m from the port"), |v| depths_m.contains(&v))?;
+    let text = format!("at least {least} m from the port on the way from the pose before");
+    number(field, port.way_depth_m(from_m, to_m), &text, |v| v >= *depths_m.start()).map(drop)
 }
 
 /// Reads the time of a pose, which must be later than that of the pose before, s.
