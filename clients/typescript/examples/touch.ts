@@ -22,5 +22,5 @@ const [x, y] = [0.5 * (pointsX - 1) * spacingM, 0.5 * (pointsY - 1) * spacingM];
 const begunMs = performance.now();
 await tool.touch((nowMs) => {
   const part = Math.min(1, (nowMs - begunMs) / 1000);
-  return { lead: { positionM: [x, y, 0.02 - 0.024 * part], radiusM: 0.005 }, isMoving: part < 1 };
+  return { leads: [{ positionM: [x, y, 0.02 - 0.024 * part], radiusM: 0.005 }], isMoving: part < 1 };
 });

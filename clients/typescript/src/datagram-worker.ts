@@ -5,7 +5,7 @@ import { create, fromBinary, toBinary } from "@bufbuild/protobuf";
 import { DatagramHealth } from "./datagram-health.js";
 import { PosesDatagramSchema, SampleDatagramSchema, TouchResponseSchema } from "./gen/palpate/v1/haptic_pb.js";
 import type { Rejection, Sample } from "./gen/palpate/v1/haptic_pb.js";
-import { type Lead, Poses } from "./poses.js";
+import { type Lead, MAX_POSED, Poses } from "./poses.js";
 
 /** Interval between poses of a tool at rest. The server holds a tool after 50 ms without a pose. */
 const REPEAT_MS = 20;
@@ -29,15 +29,15 @@ const OLD_MS = 50;
 export interface Order {
   url: string;
   certificateSha256: Uint8Array<ArrayBuffer>;
-  tool: number;
+  tools: readonly number[];
 }
 
 /**
- * Further messages of the page: the target of the tip. `from` is the sequence of the first pose since another action
+ * Further messages of the page: the target of each tool's tip. `from` is the sequence of the first pose since another action
  * was commanded.
  */
 export interface Led {
-  lead: Lead;
+  leads: readonly Lead[];
   from: bigint;
 }
 
@@ -80,7 +80,7 @@ class DatagramWorker {
   private readonly health = new DatagramHealth();
   private readonly writer: WritableStreamDefaultWriter<Uint8Array>;
   private counted = { poses: 0, samples: 0 };
-  private poses: Poses | undefined;
+  private poses: Poses[] = [];
   private led: Led | undefined;
   private ledMs = 0;
   private posedMs = 0;
@@ -123,7 +123,8 @@ class DatagramWorker {
   lead(led: Led): void {
     this.ledMs = performance.now();
     if (!this.led) this.posedMs = this.ledMs;
-    if (this.led?.from !== led.from) this.poses = new Poses(this.order.tool, led.from);
+    const { tools } = this.order;
+    if (this.led?.from !== led.from) this.poses = tools.map((tool) => new Poses(tool, led.from, tools.length));
     this.led = led;
     this.pose(this.ledMs);
   }
@@ -147,13 +148,15 @@ class DatagramWorker {
   }
 
   private pose(now: number): void {
-    if (!this.led || !this.poses || !this.carries) return;
+    if (!this.led || !this.carries) return;
     const timeNs = BigInt(Math.round(now * 1e6));
     // The clock of a page is coarse, but each pose needs a different time.
     this.timeNs = timeNs > this.timeNs ? timeNs : this.timeNs + 1n;
     this.posedMs = now;
     this.counted.poses += 1;
-    this.send([this.poses.message(this.led.lead, this.timeNs)], now);
+    const { leads } = this.led;
+    const messages = this.poses.map((poses, index) => poses.message(leads[index]!, this.timeNs));
+    for (let from = 0; from < messages.length; from += MAX_POSED) this.send(messages.slice(from, from + MAX_POSED), now);
   }
 
   private send(tools: ReturnType<Poses["message"]>[], now: number): void {
@@ -211,9 +214,9 @@ class DatagramWorker {
 
   private passOn(sample: Sample | undefined, now: number): void {
     if (!sample) return this.tell({});
-    const tool = sample.tools.find(({ tool }) => tool === this.order.tool);
+    const tool = sample.tools.find(({ tool }) => tool === this.order.tools[0]);
     // Times of calls are from a different clock.
-    if (tool && this.led && this.poses?.has(tool.acknowledgedSequence)) {
+    if (tool && this.led && this.poses[0]?.has(tool.acknowledgedSequence)) {
       this.networkMs = Math.max(0, now - Number(tool.clientTimeNs + tool.serverHoldNs) / 1e6);
     } else {
       this.networkMs = undefined;
@@ -241,6 +244,6 @@ let worker: DatagramWorker | undefined;
 page.onmessage = ({ data }) => {
   if (data === "close") return worker ? worker.close() : page.close();
   if (data === "rest") return worker?.rest();
-  if ("lead" in data) return worker?.lead(data);
+  if ("leads" in data) return worker?.lead(data);
   worker = new DatagramWorker(data);
 };

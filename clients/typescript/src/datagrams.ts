@@ -31,7 +31,7 @@ export class Datagrams {
   onChange: () => void = () => {};
   /** Called when the server may have ended the touch because no pose arrived for too long. */
   onGap: () => void = () => {};
-  /** Called with what each sample says of the tool. */
+  /** Called with what each sample says of a tool of the lease. */
   onTool: (sample: ToolSample) => void = () => {};
   networkMs: number | undefined;
   /** Whether datagrams get through. */
@@ -47,7 +47,7 @@ export class Datagrams {
   constructor(
     private readonly server: Server,
     private readonly sessionId: string,
-    private readonly tool: number,
+    private readonly tools: readonly number[],
     private readonly sampleEverySteps: number,
   ) {}
 
@@ -97,7 +97,7 @@ export class Datagrams {
     };
     worker.onerror = () => this.worker === worker && this.failed(false);
     const url = `https://${host}:${offer.port}/touch/${ticket}`;
-    worker.postMessage({ url, certificateSha256: offer.certificateSha256.slice(), tool: this.tool } satisfies Order);
+    worker.postMessage({ url, certificateSha256: offer.certificateSha256.slice(), tools: this.tools } satisfies Order);
   }
 
   private heard({ carries, counts, networkMs, sample, rejection, isOver, lastPoseMs }: Heard): void {
@@ -116,12 +116,11 @@ export class Datagrams {
   private take(sample: Sample): void {
     if (sample.ownershipRevision < this.revision) return;
     this.revision = sample.ownershipRevision;
-    const tool = sample.tools.find(({ tool }) => tool === this.tool);
-    if (tool) this.onTool(tool);
+    for (const tool of sample.tools) if (this.tools.includes(tool.tool)) this.onTool(tool);
     this.onSample(sample);
   }
 
-  /** Sends poses of the tip until `rest`. Their sequences increase from `from`. */
+  /** Sends poses of the tips until `rest`. Their sequences increase from `from`. */
   lead(led: Led): void {
     this.worker?.postMessage(led);
   }

@@ -1,10 +1,22 @@
 // See and touch tissue from a browser. `Server` provides the calls of the protocol (palpate/v1); `fetchMesh` and
-// `Frames` provide the surface, `watchSamples` what the tools feel, and a `Tool` touches.
+// `Frames` provide the surface, `watchSamples` what the tools feel, a `Tool` touches, and an `InstrumentTool` leads an
+// `Instrument`.
 
 export { Field, type Rectangle } from "./field.js";
 export { Frames, type FrameTold } from "./frames.js";
 export { fetchMesh, meshOf, type MeshData } from "./geometry.js";
-export { type Lead } from "./poses.js";
+export {
+  grasper,
+  Instrument,
+  type InstrumentPose,
+  type InstrumentTip,
+  MAX_TIPS,
+  type Row,
+  type TipForces,
+  type Wrench,
+} from "./instrument.js";
+export { type InstrumentFelt, InstrumentTool } from "./instrument-tool.js";
+export { type Lead, type Tip } from "./poses.js";
 export { watchSamples } from "./samples.js";
 export {
   backoffMs,
@@ -22,4 +34,4 @@ export {
   sleep,
 } from "./server.js";
 export { type Action, Tool, type Wanted } from "./tool.js";
-export { norm, vec, type Vec3 } from "./vector.js";
+export { cross, dot, norm, plus, rotated, type Rotation, rotationTo, unit, vec, type Vec3 } from "./vector.js";

@@ -4,17 +4,28 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { EarlierPoseSchema, PoseSchema, TipShape, ToolPosesSchema } from "./gen/palpate/v1/haptic_pb.js";
 import type { Vec3 } from "./vector.js";
 
-/** Maximum number of poses before the newest. */
+/** Maximum number of poses before the newest: of a tool, and of all tools in a datagram, which has room for so many. */
 const MAX_EARLIER = 8;
+const MAX_EARLIER_OF_ALL = 24;
+/** Maximum number of tools in a datagram. */
+export const MAX_POSED = 6;
 /** Largest difference that fits into the message, nm. */
 const FAR_NM = 1e10;
 
-/** Target of the tip. */
-export interface Lead {
-  positionM: Vec3;
+/** The tip of a tool. */
+export interface Tip {
   radiusM: number;
+  /** μ of Coulomb's friction; 0.2 if absent. */
+  friction?: number;
   /** A disc of even pressure if absent. Other tips touch solids alone. */
   shape?: TipShape;
+  /** Whether it holds the tissue, and pulls as well as pushes; else it touches. Discs only. */
+  grasps?: boolean;
+}
+
+/** Target of a tip. */
+export interface Lead extends Tip {
+  positionM: Vec3;
 }
 
 /** A pose that was sent. */
@@ -25,23 +36,29 @@ interface Posed {
 }
 
 /** Converts a pose to a message. */
-export function poseOf({ positionM: [x, y, z], radiusM, shape }: Lead): MessageInitShape<typeof PoseSchema> {
-  return { positionM: { x, y, z }, tip: { radiusM, shape } };
+export function poseOf({ positionM: [x, y, z], radiusM, friction, shape, grasps }: Lead): MessageInitShape<typeof PoseSchema> {
+  return { positionM: { x, y, z }, tip: { radiusM, friction, shape, grasps } };
 }
 
 /** The newest poses of a tool with a single tip. */
 export class Poses {
   /** Newest first. */
   private recent: Posed[] = [];
+  private readonly maxEarlier: number;
+  /** Whether those grasp: earlier poses have the same tip. */
+  private grasps = false;
 
   /** Sequence of the next pose. */
   private sequence: bigint;
 
+  /** `ofAll`: the number of tools whose poses go together. */
   constructor(
     private readonly tool: number,
     private readonly first: bigint,
+    ofAll = 1,
   ) {
     this.sequence = first;
+    this.maxEarlier = Math.min(MAX_EARLIER, Math.floor(MAX_EARLIER_OF_ALL / Math.min(ofAll, MAX_POSED)));
   }
 
   /** Returns whether a sequence belongs to one of these poses. */
@@ -51,9 +68,11 @@ export class Poses {
 
   /** Adds a pose at the client's time `timeNs`, which must increase. Returns the message. */
   message(lead: Lead, timeNs: bigint): MessageInitShape<typeof ToolPosesSchema> {
+    const grasps = lead.grasps ?? false;
+    if (grasps !== this.grasps) [this.grasps, this.recent] = [grasps, []];
     const newest = { sequence: this.sequence, timeNs, positionM: lead.positionM };
     const earlier = this.recent.flatMap((before) => earlierPose(newest, before));
-    this.recent = [newest, ...this.recent].slice(0, MAX_EARLIER);
+    this.recent = [newest, ...this.recent].slice(0, this.maxEarlier);
     this.sequence += 1n;
     return { tool: this.tool, sequence: newest.sequence, clientTimeNs: timeNs, pose: poseOf(lead), earlier };
   }

@@ -1,4 +1,4 @@
-// A tool of a session, held by a lease.
+// A tool of a session, or several that move together, held by a lease.
 //
 // Commands are sent by calls. Poses of a tip are sent by datagram while datagrams get through (datagrams.ts). These
 // have times, by which the server plays them. Poses in calls have no times and take effect on arrival, because a page
@@ -16,10 +16,10 @@ type Command = MessageInitShape<typeof CommandSchema>;
 export type Action = NonNullable<Command["action"]>;
 
 /**
- * What a tool should do now: move its tip, or another action. `isMoving`: this changes with time, without a call of
- * `changed`.
+ * What a tool should do now: move its tip, of several tools that of each; or another action, which only a single tool
+ * can do. `isMoving`: this changes with time, without a call of `changed`.
  */
-export type Wanted = ({ lead: Lead } | { action: Action }) & { isMoving?: boolean };
+export type Wanted = ({ leads: readonly Lead[] } | { action: Action }) & { isMoving?: boolean };
 
 /** In the tissue's time, without a newer command: a page that vanishes does not keep pressing. */
 const TIME_TO_LIVE_S = 2;
@@ -46,6 +46,8 @@ export class Tool {
   onRefused: (message: string, reason: string) => void = () => {};
   /** Poses and samples that are sent by datagram. */
   readonly datagrams: Datagrams;
+  /** The numbers of the lease's tools. */
+  readonly tools: readonly number[];
   /** Round trip time of the last batch minus the time for which the server held it, ms. */
   private callMs: number | undefined;
   private leaseId: string | undefined;
@@ -55,7 +57,8 @@ export class Tool {
   private sequence = 0n;
   /** Sequence of the first command of this touch. */
   private first: bigint | undefined;
-  private acts = false;
+  /** Tools on which the server acts in this touch. */
+  private readonly acting = new Set<number>();
   /** Whether a release is on its way, after which the touch begins anew. */
   private beginsAnew = false;
   /** The sequence from which datagrams count, while poses are sent by datagram. */
@@ -71,15 +74,20 @@ export class Tool {
   private waitsUntilMs = 0;
   private timer: ReturnType<typeof setInterval> | undefined;
 
-  /** Creates tool number `tool` of a session; others see `holder` as its name. The tool is not taken yet. */
+  /**
+   * Creates tool number `tool` of a session, or `count` tools from this number on; others see `holder` as its name. It
+   * is not taken yet.
+   */
   constructor(
     private readonly server: Server,
     readonly sessionId: string,
     private readonly holder: string,
     sampleEverySteps = 10,
     readonly tool = 0,
+    count = 1,
   ) {
-    this.datagrams = new Datagrams(server, sessionId, tool, sampleEverySteps);
+    this.tools = Array.from({ length: count }, (_, index) => tool + index);
+    this.datagrams = new Datagrams(server, sessionId, this.tools, sampleEverySteps);
     this.datagrams.onChange = () => this.changed();
     this.datagrams.onGap = () => this.beginAnew();
     this.datagrams.onTool = (sample) => this.note(sample);
@@ -106,7 +114,12 @@ export class Tool {
    * Until this is true, a tip belongs beside the tissue: where it begins tells its side of an open surface.
    */
   get isActing(): boolean {
-    return this.acts;
+    return this.acting.size === this.tools.length;
+  }
+
+  /** Returns whether a tool is one of these. */
+  has(tool: number): boolean {
+    return this.tools.includes(tool);
   }
 
   /** Takes the tool if it is free. */
@@ -117,11 +130,13 @@ export class Tool {
   }
 
   private async acquire(): Promise<boolean> {
-    const { sessionId, tool, holder } = this;
+    const { sessionId, holder } = this;
+    const [tool, ...moreTools] = this.tools;
     try {
       const call = { timeoutMs: CALL_TIMEOUT_MS };
       await this.leaving;
-      const { leaseId } = await this.server.haptics.acquireTool({ sessionId, tool, leaseS: LEASE_S, holder }, call);
+      const request = { sessionId, tool, moreTools, leaseS: LEASE_S, holder };
+      const { leaseId } = await this.server.haptics.acquireTool(request, call);
       this.leaseId = leaseId;
       this.sequence = 0n;
       this.from = undefined;
@@ -138,10 +153,16 @@ export class Tool {
     }
   }
 
+  /** Waits with taking the tool until something has ended: another lease of it. */
+  takeAfter(ended: Promise<void>): void {
+    this.leaving = ended;
+  }
+
   /** Begins to touch: takes the tool if needed, and calls `wanted` regularly to learn what the tool should do. */
   async touch(wanted: (nowMs: number) => Wanted): Promise<boolean> {
     this.wanted = wanted;
-    [this.first, this.acts] = [undefined, false];
+    this.first = undefined;
+    this.acting.clear();
     this.released = false;
     this.touchedMs = performance.now();
     this.fresh = true;
@@ -152,7 +173,7 @@ export class Tool {
 
   /** Moves the tip of the tool to a position, where it stays until the next call of `lead` or `rest`. */
   lead(lead: Lead): Promise<boolean> {
-    return this.touch(() => ({ lead }));
+    return this.touch(() => ({ leads: [lead] }));
   }
 
   /** To be called when the result of `wanted` changes. */
@@ -196,20 +217,22 @@ export class Tool {
   }
 
   /** Learns from the server's sample whether it acts on this touch. */
-  private note({ acknowledgedSequence, expired }: ToolSample): void {
+  private note({ tool, acknowledgedSequence, expired }: ToolSample): void {
     if (!this.wanted || this.first === undefined || acknowledgedSequence < this.first) return;
-    if (this.acts && expired) return this.beginAnew();
-    if (this.acts === !expired) return;
-    this.acts = !expired;
-    this.changed();
+    if (this.isActing && expired) return this.beginAnew();
+    if (expired) this.acting.delete(tool);
+    if (expired || this.acting.has(tool)) return;
+    this.acting.add(tool);
+    if (this.isActing) this.changed();
   }
 
   /** Releases what the server may still hold, and begins the touch anew. */
   private beginAnew(): void {
     const { leaseId } = this;
     if (!leaseId || !this.wanted || this.beginsAnew) return;
-    [this.first, this.acts, this.beginsAnew] = [undefined, false, true];
-    const released = this.send(leaseId, [this.command(undefined, performance.now())]);
+    [this.first, this.beginsAnew] = [undefined, true];
+    this.acting.clear();
+    const released = this.send(leaseId, this.commands(undefined, performance.now()));
     void released.finally(() => {
       this.beginsAnew = false;
       this.changed();
@@ -220,9 +243,9 @@ export class Tool {
   private tick(): void {
     if (!this.leaseId || this.beginsAnew) return;
     const now = performance.now();
-    if (this.acts && this.from === undefined && now - this.sentMs > MAX_SILENCE_MS) return this.beginAnew();
+    if (this.isActing && this.from === undefined && now - this.sentMs > MAX_SILENCE_MS) return this.beginAnew();
     const wanted = this.wanted?.(now);
-    if (wanted && "lead" in wanted && this.datagrams.carries) return this.leadOn(wanted.lead, now);
+    if (wanted && "leads" in wanted && this.datagrams.carries) return this.leadOn(wanted.leads, now);
     if (this.underWay >= IN_FLIGHT || now < this.waitsUntilMs) return;
     const isRest = !wanted && this.released;
     if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
@@ -230,33 +253,35 @@ export class Tool {
     if (!this.fresh && now - this.sentMs < (isRest ? (LEASE_S * 1000) / 4 : REPEAT_MS)) return;
     this.fresh = wanted?.isMoving ?? false;
     this.sentMs = now;
-    const commands = isRest ? [] : [this.command(wanted, now)];
+    const commands = isRest ? [] : this.commands(wanted, now);
     this.released = !wanted;
     void this.send(this.leaseId, commands);
   }
 
-  private leadOn(lead: Lead, now: number): void {
+  private leadOn(leads: readonly Lead[], now: number): void {
     this.from ??= this.sequence += APART;
     this.first ??= this.from;
-    this.datagrams.lead({ lead, from: this.from });
+    this.datagrams.lead({ leads, from: this.from });
     // Datagrams keep the lease.
     this.sentMs = now;
     this.fresh = false;
   }
 
-  private command(wanted: Wanted | undefined, now: number): Command {
+  /** Returns the commands of the next batch: one for each tool, all with the same sequence. */
+  private commands(wanted: Wanted | undefined, now: number): Command[] {
     this.datagrams.rest();
     this.sequence += this.from === undefined ? 1n : APART;
     this.from = undefined;
-    const { tool, sequence } = this;
-    const command = { tool, sequence, clientTimeNs: BigInt(Math.round(now * 1e6)) };
-    if (!wanted) return { ...command, action: { case: "release", value: {} } };
+    const { sequence, tools } = this;
+    const clientTimeNs = BigInt(Math.round(now * 1e6));
+    if (!wanted) return tools.map((tool) => ({ tool, sequence, clientTimeNs, action: { case: "release", value: {} } }));
     this.first ??= sequence;
     const timeToLiveS = TIME_TO_LIVE_S;
-    if ("lead" in wanted) {
-      return { ...command, clientTimeNs: 0n, timeToLiveS, action: { case: "pose", value: poseOf(wanted.lead) } };
-    }
-    return { ...command, timeToLiveS, action: wanted.action };
+    if ("action" in wanted) return [{ tool: this.tool, sequence, clientTimeNs, timeToLiveS, action: wanted.action }];
+    return wanted.leads.map((lead, index) => {
+      const action = { case: "pose" as const, value: poseOf(lead) };
+      return { tool: tools[index], sequence, timeToLiveS, action };
+    });
   }
 
   private async send(leaseId: string, commands: Command[]): Promise<void> {
@@ -277,10 +302,10 @@ export class Tool {
   }
 
   private measure(sample: Sample, tookMs: number): void {
-    const tool = sample.tools.find(({ tool }) => tool === this.tool);
-    if (!tool) return;
-    this.note(tool);
-    if (tool.acknowledgedSequence === this.sequence) {
+    const own = sample.tools.filter(({ tool }) => this.has(tool));
+    for (const tool of own) this.note(tool);
+    const [tool] = own;
+    if (tool?.acknowledgedSequence === this.sequence) {
       this.callMs = Math.max(0, tookMs - Number(tool.serverHoldNs) / 1e6);
     }
   }

@@ -2,15 +2,16 @@
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
 // stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and moves it with
-// the drag. A tip is held at a depth, and glides. A place has a side on which it is touched, and pushes go into the
-// tissue from there.
+// the drag. A tip is held at a depth, and glides. A grasper (grasper.ts) has several tools. A place has a side on which
+// it is touched, and pushes go into the tissue from there.
 
 import { type Action, type Lead, Tool, type Vec3, type Wanted } from "palpate";
-import { type TipShape } from "palpate/v1";
+import { type Sample, type TipShape } from "palpate/v1";
+import { Grasper, type View } from "./grasper";
 import { server } from "./server";
 import type { Place, Surface } from "./surface";
 
-export type Mode = "push" | "pull" | "stroke" | "tip";
+export type Mode = "push" | "pull" | "stroke" | "tip" | "grasper";
 
 /** A tip moves down from beside the tissue in this time, so that the server knows from which side it comes. */
 const SINK_MS = 250;
@@ -29,15 +30,21 @@ export interface Reach {
   depthM: number;
   /** Shape of the tip: a solid yields to a rigid one at any depth, and is unstable under an even pressure that is deep. */
   tipShape: TipShape;
+  /** Number of tips of a grasper's jaw: on a mesh, each takes much time to compute. */
+  jawTips: number;
 }
 
 export class Hand {
-  mode: Mode = "push";
   /** Strength, 0 to 1. */
   strength = 0.5;
-  readonly tool: Tool;
+  readonly grasper: Grasper;
   onChange: () => void = () => {};
+  /** Called with samples of the hand's tools that arrived by datagram. */
+  onSample: (sample: Sample) => void = () => {};
+  onJaws: () => void = () => {};
   onRefused: (message: string, reason: string) => void = () => {};
+  private readonly single: Tool;
+  private chosen: Mode = "push";
   private place: Place | undefined;
   private onSurfaceM: Vec3 = [0, 0, 0];
   private leanM: Vec3 = [0, 0, 0];
@@ -51,10 +58,36 @@ export class Hand {
     private readonly surface: () => Surface,
     sampleEverySteps: number,
   ) {
-    // All pages use the same tool.
-    this.tool = new Tool(server, sessionId, name, sampleEverySteps);
-    this.tool.onChange = () => this.onChange();
-    this.tool.onRefused = (message, reason) => this.onRefused(message, reason);
+    // All pages use the same tool, and a grasper those after it, too.
+    this.single = new Tool(server, sessionId, name, sampleEverySteps);
+    this.grasper = new Grasper(sessionId, name, reach, sampleEverySteps);
+    for (const tool of [this.single, this.grasper.tool]) {
+      tool.onChange = () => this.onChange();
+      tool.onRefused = (message, reason) => this.onRefused(message, reason);
+      tool.datagrams.onSample = (sample) => this.onSample(sample);
+    }
+  }
+
+  /** The tool of the present mode. */
+  get tool(): Tool {
+    return this.mode === "grasper" ? this.grasper.tool : this.single;
+  }
+
+  get mode(): Mode {
+    return this.chosen;
+  }
+
+  /** Chooses another mode, which ends a touch. */
+  set mode(mode: Mode) {
+    const former = this.tool;
+    former.rest();
+    this.chosen = mode;
+    if (former !== this.tool) this.tool.takeAfter(former.letGo());
+  }
+
+  /** Whether a grasper touches. */
+  get grasps(): boolean {
+    return this.mode === "grasper" && this.holds;
   }
 
   get holds(): boolean {
@@ -70,7 +103,7 @@ export class Hand {
    * direction.
    */
   get outward(): Vec3 | undefined {
-    return this.mode === "tip" ? undefined : this.place?.outward;
+    return this.mode === "tip" || this.mode === "grasper" ? undefined : this.place?.outward;
   }
 
   /** Whether it touches the outer side of the tissue. It stays on its side wherever it slips. */
@@ -78,10 +111,15 @@ export class Hand {
     return this.place && this.surface().isOuter(this.place);
   }
 
+  /** Depth of a tip or of open jaws, which are thinner, m. */
+  get depthM(): number {
+    return (this.mode === "grasper" ? 0.5 : 1) * this.strength * this.reach.depthM;
+  }
+
   /** Target depth of the tip, once it has had the time to get there; undefined if no tip is used. */
   get setM(): number | undefined {
     const hasSunk = performance.now() - (this.sinksFromMs ?? Infinity) > SINK_MS + SETTLES_MS;
-    return this.mode === "tip" && this.tool.touches && hasSunk ? this.strength * this.reach.depthM : undefined;
+    return this.mode === "tip" && this.tool.touches && hasSunk ? this.depthM : undefined;
   }
 
   /** Factor for displayed forces on the tool: for a push on a body, the total force is shown. */
@@ -90,11 +128,12 @@ export class Hand {
   }
 
   /** Begins to touch at `place`, which is now at `onSurfaceM`. */
-  async press(place: Place, onSurfaceM: Vec3): Promise<void> {
+  async press(place: Place, onSurfaceM: Vec3, view: View): Promise<void> {
     this.place = place;
     this.onSurfaceM = onSurfaceM;
     this.leanM = [0, 0, 0];
     this.sinksFromMs = undefined;
+    if (this.mode === "grasper") this.grasper.begin(place, view);
     await this.tool.touch((now) => this.wanted(place, now));
   }
 
@@ -106,6 +145,15 @@ export class Hand {
     const kept = Math.exp(-Math.hypot(...way) / this.reach.depthM);
     this.place = place;
     this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], kept * this.leanM[2] + way[2]]);
+  }
+
+  /** Opens the jaws to a fraction of their largest angle. */
+  openJaws(part: number): void {
+    const { grips } = this.grasper;
+    this.grasper.opening = part;
+    // What they grip moves with the drag from here on.
+    if (this.grasper.grips && !grips) this.leanM = [0, 0, 0];
+    this.onJaws();
   }
 
   /** Leans by `leanM` from the place of the press. */
@@ -128,9 +176,12 @@ export class Hand {
   /** Returns what the tool should do: at the place of the press, or where it has moved to. */
   private wanted(pressed: Place, now: number): Wanted {
     const place = this.place ?? pressed;
-    if (this.mode === "tip") {
+    if (this.mode === "tip" || this.mode === "grasper") {
       this.sinksFromMs = this.tool.isActing ? (this.sinksFromMs ?? now) : undefined;
-      return { lead: this.tip(place, now), isMoving: this.sunk(now) < 1 };
+      const isMoving = this.sunk(now) < 1;
+      if (this.mode === "tip") return { leads: [this.tip(place, now)], isMoving };
+      const wanted = this.grasper.wanted(place, this.outM(now), !isMoving, this.leanM, now);
+      return { ...wanted, isMoving: isMoving || wanted.isMoving };
     }
     return { action: this.action(place) };
   }
@@ -140,12 +191,17 @@ export class Hand {
     return this.sinksFromMs === undefined ? 0 : Math.min(1, (now - this.sinksFromMs) / SINK_MS);
   }
 
-  /** Returns the position of the tip at a place: on its way from beside the tissue, or at its depth. */
+  /** Returns the position of the tip at a place. */
   private tip({ restM, outward: n }: Place, now: number): Lead {
     const radiusM = this.reach.lengthM;
-    const part = this.sunk(now);
-    const outM = (1 - part) * 1.1 * radiusM - part * this.strength * this.reach.depthM;
+    const outM = this.outM(now);
     return { positionM: [restM[0] + outM * n[0], restM[1] + outM * n[1], restM[2] + outM * n[2]], radiusM, shape: this.reach.tipShape };
+  }
+
+  /** Returns the height of a tip above its place at rest: on its way from beside the tissue, or at its depth. */
+  private outM(now: number): number {
+    const part = this.sunk(now);
+    return (1 - part) * 1.1 * this.reach.lengthM - part * this.depthM;
   }
 
   private action(place: Place): Action {

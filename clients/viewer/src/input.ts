@@ -1,6 +1,7 @@
 // Mouse, fingers and keys on the tissue.
 
 import { Vector3 } from "three";
+import { OPEN } from "./grasper";
 import type { Hand, Reach } from "./hand";
 import type { Latency } from "./latency";
 import type { Vec3 } from "palpate";
@@ -15,12 +16,15 @@ export interface Touched {
 }
 
 /** Returns whether the tool moves to the places under the drag. */
-function glides({ mode }: Hand): boolean {
-  return mode === "stroke" || mode === "tip";
+function glides({ mode, grasper }: Hand): boolean {
+  return mode === "stroke" || mode === "tip" || (mode === "grasper" && !grasper.grips);
 }
 
 /** Rotation of the view per key press, radians. */
 const TURN = 0.08;
+/** Opening of the jaws per pixel of the wheel, per event at most, and per key press. */
+const WHEEL = { pixel: 0.0015, most: 0.15 };
+const JAW_STEP = 0.15;
 
 export class Input {
   /** If set, gets the next press on the tissue instead of a touch. */
@@ -28,10 +32,16 @@ export class Input {
   /** Called with the place under a pointer that does not touch, and without a place when it leaves. */
   onPoint: (place?: Place) => void = () => {};
   private dragging: number | undefined;
-  private fingers = new Set<number>();
+  private readonly fingers = new Map<number, [number, number]>();
+  /** Distance of two fingers, and opening of the jaws, when the second finger came. */
+  private pinch: { apart: number; opening: number } | undefined;
+  /** Whether the right button is down beside the left one. */
+  private isChord = false;
   /** Start of the drag: the place, and its position then. */
   private from: { place: Place; onSurfaceM: Vec3 } | undefined;
   private aim: Place | undefined;
+  /** Where the pointer that drags is in the window. */
+  private pointer: [number, number] | undefined;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -45,6 +55,7 @@ export class Input {
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) {
       canvas.addEventListener(end, (event) => this.up(event));
     }
+    canvas.addEventListener("wheel", (event) => this.wheel(event), { capture: true, passive: false });
     canvas.addEventListener("pointerleave", () => this.onPoint());
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this.key(event));
@@ -59,10 +70,15 @@ export class Input {
   }
 
   private down(event: PointerEvent): void {
-    if (event.pointerType === "touch") this.fingers.add(event.pointerId);
+    if (event.pointerType === "touch") this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
     const { hand } = this.touched() ?? {};
     // If nothing can be touched, any drag turns the view.
     if (!hand) return this.stage.turnByDrag(true);
+    if (this.fingers.size === 2 && this.dragging !== undefined && hand.mode === "grasper") {
+      event.stopImmediatePropagation();
+      this.pinch = { apart: this.apart(), opening: hand.grasper.opening };
+      return;
+    }
     // A second finger turns the view instead.
     if (this.fingers.size > 1) return this.finish();
     if (event.button !== 0 || this.dragging !== undefined) return;
@@ -75,6 +91,7 @@ export class Input {
     this.latency.pressed(event.timeStamp);
     this.canvas.setPointerCapture(event.pointerId);
     this.dragging = event.pointerId;
+    this.pointer = [event.clientX, event.clientY];
     this.begin(hand, place);
   }
 
@@ -86,7 +103,41 @@ export class Input {
     const moved = surface.displacementAt(held);
     const [x, y, z] = held.restM;
     this.from = { place: held, onSurfaceM: [x + moved.x, y + moved.y, z + moved.z] };
-    void hand.press(held, this.from.onSurfaceM);
+    void hand.press(held, this.from.onSurfaceM, this.stage.viewOf(held));
+    if (hand.mode === "grasper") hand.onJaws();
+  }
+
+  /** Distance of the first two fingers, pixels. */
+  private apart(): number {
+    const [[ax, ay], [bx, by]] = [...this.fingers.values()] as [[number, number], [number, number]];
+    return Math.max(Math.hypot(ax - bx, ay - by), 1);
+  }
+
+  /** Moves the jaws of a grasper to a fraction of their largest angle. */
+  moveJaws(part: number): void {
+    const { hand } = this.touched() ?? {};
+    if (hand?.mode !== "grasper") return;
+    const { grips } = hand.grasper;
+    hand.openJaws(part);
+    const { grips: gripsNow, endsM } = hand.grasper;
+    if (gripsNow === grips || !this.from || !endsM) return;
+    if (gripsNow) {
+      // The drag counts from here.
+      const onSurfaceM = (this.pointer && this.stage.onFacingPlane(...this.pointer, endsM)) ?? endsM;
+      this.from = { place: this.aim ?? this.from.place, onSurfaceM };
+    } else if (this.pointer) {
+      const place = this.stage.pick(...this.pointer);
+      if (place) hand.goOn(place);
+    }
+  }
+
+  private wheel(event: WheelEvent): void {
+    const { hand } = this.touched() ?? {};
+    if (!hand || hand.mode !== "grasper" || !hand.touches) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    const by = Math.min(Math.max(-WHEEL.pixel * event.deltaY, -WHEEL.most), WHEEL.most);
+    this.moveJaws(hand.grasper.opening + by);
   }
 
   private moved(event: PointerEvent): void {
@@ -95,12 +146,21 @@ export class Input {
     if (hand && isMouse && this.dragging === undefined) {
       this.onPoint(event.buttons === 0 ? this.stage.pick(event.clientX, event.clientY) : undefined);
     }
-    if (event.pointerId !== this.dragging || !hand || !this.from) return;
+    if (this.fingers.has(event.pointerId)) this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    if (this.pinch && this.fingers.size > 1) this.moveJaws((this.pinch.opening * this.apart()) / this.pinch.apart);
+    if (event.pointerId !== this.dragging || !hand) return;
+    // While one button is down, others come and go as movements.
+    if (isMouse && (event.buttons & 1) === 0) return this.finish();
+    this.pointer = [event.clientX, event.clientY];
+    const isChord = (event.buttons & 2) !== 0;
+    if (isChord !== this.isChord) this.moveJaws(isChord ? 0 : OPEN);
+    this.isChord = isChord;
     if (glides(hand)) {
       const place = this.stage.pick(event.clientX, event.clientY);
       if (place) hand.goOn(place);
       return;
     }
+    if (!this.from) return;
     const at = this.stage.onFacingPlane(event.clientX, event.clientY, this.from.onSurfaceM);
     if (!at) return;
     const [x, y, z] = this.from.onSurfaceM;
@@ -109,12 +169,16 @@ export class Input {
 
   private up(event: PointerEvent): void {
     this.fingers.delete(event.pointerId);
+    if (this.fingers.size < 2) this.pinch = undefined;
     if (event.pointerId === this.dragging) this.finish();
   }
 
   private finish(): void {
     this.dragging = undefined;
     this.from = undefined;
+    this.pinch = undefined;
+    this.pointer = undefined;
+    this.isChord = false;
     this.stage.turnByDrag(false);
     this.touched()?.hand.lift();
   }
@@ -147,6 +211,10 @@ export class Input {
         if (hand.mode === "pull") hand.lean(this.lifted([0, 0, 0], this.aim, touched));
         this.stage.setAim(this.aim);
       }
+    } else if (event.key === "c") {
+      if (!event.repeat) this.moveJaws(hand.grasper.grips ? OPEN : 0);
+    } else if (event.key === "PageUp" || event.key === "PageDown") {
+      this.moveJaws(hand.grasper.opening + (event.key === "PageUp" ? JAW_STEP : -JAW_STEP));
     } else if (event.key === "Escape") {
       void hand.letGo();
     } else if (event.key === "Home") {

@@ -8,7 +8,7 @@
 // HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one acknowledgement at a time.
 
 import { create, type MessageInitShape } from "@bufbuild/protobuf";
-import { norm } from "palpate";
+import { norm, type Vec3 } from "palpate";
 import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
 import type { Mode } from "./hand";
@@ -16,7 +16,7 @@ import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { Lumps } from "./lumps";
-import { feltText, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./messages";
+import { feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./messages";
 import { Overlay } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
 import { pageState } from "./page-state";
@@ -277,8 +277,9 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   part("scripts", HTMLElement).hidden ||= isPlayback;
   next.hand.mode = chosenMode();
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
-  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason, next.session));
+  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason, next));
   next.hand.onChange = holding;
+  next.hand.onJaws = tellJaws;
   next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
@@ -383,7 +384,11 @@ function holding(): void {
     return;
   }
   const mine = shownSession.hand.holds;
-  const others = shownSession.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
+  const { tool: own } = shownSession.hand;
+  // Somebody who holds the tool may hold more for a grasper.
+  const { heldTools } = shownSession.session;
+  const isFirst = (holder: string, index: number) => holder === "" || heldTools.findIndex((tool) => tool.holder === holder) === index;
+  const others = heldTools.filter(({ tool, holder }, index) => !(mine && own.has(tool)) && isFirst(holder, index));
   const names = others.slice(0, MAX_TOLD).map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
   const whose = excerpt(names.join(", "));
   part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : whose || "Nobody touches: press to begin";
@@ -398,20 +403,33 @@ function felt(of: ShownSession): void {
     const place = of.placeOf(tool);
     if (!place) return [];
     const isMine = tool.tool === 0 && hand.holds;
+    if (isMine && hand.grasps) return [];
     const strength = isMine ? of.samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
     return [{ place, forceN: tool.forceN, part: strength }];
   });
-  stage.setTools(shown);
+  const own = hand.grasps ? of.samples.tools.find(({ tool }) => tool === 0) : undefined;
+  const forceN: Vec3 = own?.forceN ?? [0, 0, 0];
+  stage.setTools(shown, hand.grasps ? hand.grasper.shown(forceN, norm(forceN) / reach.mostN) : undefined);
 }
 
 function tellControls(): void {
   if (!shownSession) return;
   const text = strengthText(shownSession);
-  part("strength-name", HTMLElement).textContent = shownSession.hand.mode === "tip" ? "Depth" : "Strength";
+  part("strength-name", HTMLElement).textContent = isDeep(shownSession.hand.mode) ? "Depth" : "Strength";
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(shownSession.refinement);
   part("meaning", HTMLElement).textContent = meaningText(shownSession);
+  tellJaws();
+}
+
+function tellJaws(): void {
+  if (!shownSession) return;
+  const { hand } = shownSession;
+  part("jaws-part", HTMLElement).hidden = hand.mode !== "grasper";
+  part("view", HTMLElement).classList.toggle("grasps", hand.mode === "grasper");
+  part("jaws", HTMLInputElement).value = String(hand.grasper.opening);
+  part("jaws-value", HTMLOutputElement).value = hand.grasper.openingText;
 }
 
 function chosenMode(): Mode {
@@ -421,13 +439,15 @@ function chosenMode(): Mode {
 
 part("mode", HTMLElement).addEventListener("change", () => {
   if (!shownSession) return;
-  shownSession.hand.lift();
   shownSession.hand.mode = chosenMode();
   tellControls();
 });
 part("strength", HTMLInputElement).addEventListener("input", (event) => {
   if (shownSession) shownSession.hand.strength = Number((event.target as HTMLInputElement).value);
   tellControls();
+});
+part("jaws", HTMLInputElement).addEventListener("input", (event) => {
+  input.moveJaws(Number((event.target as HTMLInputElement).value));
 });
 part("release", HTMLButtonElement).addEventListener("click", () => void shownSession?.hand.letGo());
 part("wireframe", HTMLInputElement).addEventListener("change", (event) => {

@@ -1,8 +1,9 @@
 // Messages about a session and its tools for the user.
 
 import { type Session, SessionState, TipShape } from "palpate/v1";
-import { depthText } from "./overlay";
+import { depthText, jawsText } from "./overlay";
 import { quantity } from "./plot";
+import type { Mode } from "./hand";
 import type { Told } from "./samples";
 import type { ShownSession } from "./session";
 
@@ -36,17 +37,22 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
 }
 
 /** Describes for the user why a touch was refused. */
-export function refusedText(message: string, reason: string, session: Session): string {
+export function refusedText(message: string, reason: string, { session, hand }: ShownSession): string {
   if (reason === "ROLE_MISSING") return "Your token lets you watch, not touch.";
   if (reason !== "TOOL_HELD") return `${sentence(message)}.`;
-  const name = session.heldTools.find(({ tool }) => tool === 0)?.holder || "Somebody else";
+  const name = session.heldTools.find(({ tool }) => hand.tool.has(tool))?.holder || "Somebody else";
   return `${name} holds the tool. You can touch as soon as ${name} lets go.`;
 }
 
+/** Returns whether the strength of a tool is its depth. */
+export function isDeep(mode: Mode): boolean {
+  return mode === "tip" || mode === "grasper";
+}
+
 /** Describes the strength of the present tool. */
-export function strengthText({ hand: { mode, strength }, reach }: ShownSession): string {
+export function strengthText({ hand: { mode, strength, depthM }, reach }: ShownSession): string {
   if (mode === "pull") return "as you drag";
-  return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
+  return isDeep(mode) ? quantity(depthM, "m") : quantity(strength * reach.mostN, "N");
 }
 
 /** Describes what the strength means, and how this differs from what is felt. */
@@ -55,6 +61,12 @@ export function meaningText({ hand, reach, surface }: ShownSession): string {
   if (hand.mode === "tip") {
     const disc = reach.tipShape === TipShape.RIGID_DISC ? "a rigid disc" : "a disc";
     return `The tip is ${disc} of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
+  }
+  if (hand.mode === "grasper") {
+    return (
+      "The jaws open and close with the right button beside the left, with the wheel while you press, or with C. Depth is how far " +
+      "they go below the tissue at rest while they are open; closed, they hold what is between them, and move with the drag."
+    );
   }
   return surface.edge
     ? "Strength is the push in the middle of the tool. It fades out over about " +
@@ -77,7 +89,7 @@ export function feltText({ hand }: ShownSession, told: Told | undefined): string
     return `The tip has slipped off: ${now}. Set less depth.`;
   }
   if (!told) return "Nothing touches the tissue.";
-  return `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`;
+  return [depthText(told), `pushes back ${quantity(told.allN, "N")}`, jawsText(told)].filter((text) => text !== "").join(", ");
 }
 
 /** Describes the transport of a touch: datagrams belong to a lease. */

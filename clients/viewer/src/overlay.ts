@@ -17,10 +17,16 @@ export function depthText({ deepM }: Told): string {
   return deepM < 0 ? `${quantity(-deepM, "m")} lifted` : `${quantity(deepM, "m")} deep`;
 }
 
+/** Describes the torque on jaws that grip; empty if there are none. */
+export function jawsText({ openingNM }: Told): string {
+  return openingNM === undefined ? "" : `jaws ${quantity(openingNM, "N·m").replace("-", "−")}`;
+}
+
 export class Overlay {
   private readonly touch = part("touch", HTMLElement);
   private readonly depth = part("touch-depth", HTMLElement);
   private readonly force = part("touch-force", HTMLElement);
+  private readonly jaws = part("touch-jaws", HTMLElement);
   private readonly bar = part("scale-bar", HTMLElement);
   private readonly length = part("scale-text", HTMLElement);
   private readonly ring = document.getElementById("pointer-ring") as unknown as SVGPathElement;
@@ -43,6 +49,7 @@ export class Overlay {
   private write(felt: Told): void {
     this.depth.textContent = depthText(felt);
     this.force.textContent = `${quantity(felt.allN, "N")} back`;
+    this.jaws.textContent = jawsText(felt);
   }
 
   /** Shows what a press would move; nothing without a place. The picture itself need not be drawn again. */

@@ -1,6 +1,6 @@
 // State of the page, for tests and measurements: `window.palpate`.
 
-import { norm } from "palpate";
+import { norm, vec } from "palpate";
 import type { Latency } from "./latency";
 import { pictureFrom } from "./pictures";
 import type { Player } from "./player";
@@ -30,6 +30,11 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     },
     get forceN() {
       return present()?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
+    },
+    /** Forces on each tool of the hand, by the newest sample. */
+    get ownForcesN() {
+      const { hand, samples } = present() ?? {};
+      return (samples?.newest?.tools ?? []).flatMap((tool) => (hand?.tool.has(tool.tool) ? [norm(vec(tool.forceOnToolN))] : []));
     },
     /** Largest displacement of the control point during the time span of the plots. */
     get deepestM() {

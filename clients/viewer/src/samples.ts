@@ -13,6 +13,8 @@ export interface Felt {
   displacementM: Vec3;
   forceN: Vec3;
   appliedN: Vec3;
+  /** Torque that opens the jaws, if it is a grasper with its jaws closed, N·m. */
+  openingNM?: number;
 }
 
 /** What a tool feels, relative to the direction out of the tissue at its place. */
@@ -24,6 +26,8 @@ export interface Told {
   outN: number;
   acrossN: number;
   allN: number;
+  /** Torque of the tissue that opens closed jaws, N·m. */
+  openingNM?: number;
 }
 
 /** One moment in the plots. */
@@ -72,6 +76,8 @@ export class Samples {
   constructor(
     private readonly pointN: number,
     private readonly sense: (tool: Felt) => Sense,
+    /** Returns the tools to show, with those of an instrument as one. */
+    private readonly joined: (tools: Felt[]) => Felt[],
   ) {}
 
   /** Converts a tool's sample to the directions of the place that it touches. */
@@ -80,7 +86,7 @@ export class Samples {
     const [u, f] = [tool.displacementM, tool.forceN];
     const along = (v: Vec3) => v[0] * n[0] + v[1] * n[1] + v[2] * n[2];
     const across = (v: Vec3) => norm([v[0] - along(v) * n[0], v[1] - along(v) * n[1], v[2] - along(v) * n[2]]);
-    return { deepM: -along(u), asideM: across(u), outN: share * along(f), acrossN: share * across(f), allN: share * norm(f) };
+    return { deepM: -along(u), asideM: across(u), outN: share * along(f), acrossN: share * across(f), allN: share * norm(f), openingNM: tool.openingNM };
   }
 
   /** Continues from the samples of another session, which had the same history until `timeS`. */
@@ -113,7 +119,7 @@ export class Samples {
   private take(sample: Sample, tools: ToolSample[]): void {
     if (!Number.isFinite(sample.simulationTimeS) || (this.newest && sample.step < this.newest.step)) return;
     this.newest = sample;
-    const felt = tools
+    const each = tools
       .slice(0, MAX_TOOLS)
       .filter((tool) => tool.point !== undefined || tool.vertex !== undefined)
       .map((tool) => ({
@@ -124,6 +130,7 @@ export class Samples {
         forceN: vec(tool.forceOnToolN),
         appliedN: vec(tool.appliedForceN),
       }));
+    const felt = this.joined(each);
     // The server reports a released tool while its point still moves, so the plots show it come to rest.
     const least = FELT * this.pointN;
     this.tools = felt.filter((tool) => norm(tool.appliedN) > least || norm(tool.forceN) > least);

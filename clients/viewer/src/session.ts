@@ -3,7 +3,7 @@
 import { Body } from "./body";
 import { fingerM } from "./coefficients";
 import { isBarred } from "./token-form";
-import { fetchMesh, Frames, type MeshData, norm } from "palpate";
+import { fetchMesh, Frames, type MeshData, norm, plus, type Vec3 } from "palpate";
 import { type Session, TipShape } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
@@ -103,13 +103,13 @@ export class ShownSession {
       const { sum } = this.surface.push(this.surface.middle(), lengthM);
       // If the springs of a tissue differ, no such force can be given.
       const mostN = rounded(sum * aPointN || 2);
-      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape };
+      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape, jawTips: 1 };
       this.widthM = sizeM;
     } else {
       // A push falls off over a spacing, so that a few points share it: its depth is about two spacings.
       const lengthM = grid?.spacingM ?? 1;
       const mostN = 2 * lengthM * (2 * k + anchor) || lengthM;
-      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape };
+      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape, jawTips: 3 };
       this.widthM = (this.points[0] - 1) * lengthM;
     }
     // A mesh is shown with its own vertices.
@@ -121,11 +121,11 @@ export class ShownSession {
       this.refinement = former?.refinement ?? Math.min(refinement ?? chosen, this.mostRefinement);
     }
     this.surface ??= former?.surface ?? this.newSheet();
-    this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool));
+    this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool), (tools) => this.joined(tools));
     // Until its own samples arrive, those of the former session are shown.
     if (former) this.samples.follow(former.samples, session.simulationTimeS);
     this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz));
-    this.hand.tool.datagrams.onSample = (sample) => this.samples.takeOwn(sample);
+    this.hand.onSample = (sample) => this.samples.takeOwn(sample);
   }
 
   /** Returns the number of vertices along a side of a sheet at refinement n: M = (m − 1)·n + m. */
@@ -150,6 +150,19 @@ export class ShownSession {
   placeOf(tool: Felt): Place | undefined {
     const isMine = tool.tool === 0 && this.hand.holds;
     return this.surface.ofTool(tool, isMine ? this.hand.isOuter : undefined);
+  }
+
+  /** Returns tools with those of this page's grasper as one: at the tip that feels most, with the sum of the forces. */
+  private joined(tools: Felt[]): Felt[] {
+    const { grasps, grasper } = this.hand;
+    const own = grasps ? tools.filter(({ tool }) => grasper.tool.has(tool)) : [];
+    const felt = grasper.felt(own);
+    if (!felt || own.length === 0) return tools;
+    const most = own.reduce((a, b) => (norm(b.forceN) > norm(a.forceN) ? b : a));
+    const appliedN = own.reduce<Vec3>((sum, tool) => plus(sum, tool.appliedN), [0, 0, 0]);
+    const openingNM = grasper.grips ? felt.openingNM : undefined;
+    const joined = { ...most, tool: grasper.tool.tool, forceN: felt.forceN, appliedN, openingNM };
+    return [joined, ...tools.filter((tool) => !own.includes(tool))];
   }
 
   begin(): void {

@@ -25,6 +25,8 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { Body } from "./body";
 import { Effort, isDrawnBySoftware } from "./effort";
+import type { ShownGrasper, View } from "./grasper";
+import { GrasperMark } from "./grasper-mark";
 import { Ground } from "./ground";
 import { defaultCameraOfBody, defaultCameraOfSheet } from "./default-camera";
 import { light, Skin, SHADOWS } from "./material";
@@ -91,6 +93,8 @@ export class Stage {
   private surface: Surface | undefined;
   private readonly marks: ToolMark[] = [];
   private tools: ShownTool[] = [];
+  private readonly grasperMark = new GrasperMark();
+  private grasper: ShownGrasper | undefined;
   private aim: Place | undefined;
   /** Whether the camera is still in its initial position. */
   private isHome = true;
@@ -128,7 +132,7 @@ export class Stage {
     this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !this.isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.camera.up.set(0, 0, 1);
-    this.scene.add(this.camera);
+    this.scene.add(this.camera, this.grasperMark.group);
     this.orbit = new OrbitControls(this.camera, canvas);
     // The left button and one finger control the tool.
     this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.PAN, RIGHT: MOUSE.ROTATE };
@@ -241,8 +245,10 @@ export class Stage {
     this.draw();
   }
 
-  setTools(tools: ShownTool[]): void {
+  /** Shows tools, and this page's own grasper. */
+  setTools(tools: ShownTool[], grasper?: ShownGrasper): void {
     const isSame =
+      grasper?.pose === this.grasper?.pose &&
       tools.length === this.tools.length &&
       tools.every(({ place, forceN, part }, index) => {
         const old = this.tools[index]!;
@@ -250,7 +256,7 @@ export class Stage {
         return place.restM.every((v, c) => v === old.place.restM[c]) && forceN.every((v, c) => Math.abs(v - old.forceN[c]!) < least);
       });
     if (isSame) return;
-    this.tools = tools;
+    [this.tools, this.grasper] = [tools, grasper];
     while (this.marks.length < tools.length) {
       const mark = new ToolMark(this.marks.length);
       this.marks.push(mark);
@@ -271,6 +277,8 @@ export class Stage {
       if (tool && surface) this.marks[index]!.show(tool, surface, surface.sizeM, this.seen);
       else this.marks[index]!.hide();
     }
+    if (this.grasper && surface && !this.held) this.grasperMark.show(this.grasper, surface, surface.sizeM);
+    else this.grasperMark.hide();
     const ring = light.rings.value[SHADOWS]!;
     ring.w = 0;
     if (!this.aim || !surface || this.held) return;
@@ -280,6 +288,7 @@ export class Stage {
 
   /** Returns the window position of the first tool's tip; undefined if there is no tool. */
   tipInWindow(): [number, number] | undefined {
+    if (this.grasper) return this.inWindow(this.grasperMark.endsM.toArray());
     return this.tools.length > 0 && this.marks[0] ? this.inWindow(this.marks[0].tipM.toArray()) : undefined;
   }
 
@@ -407,6 +416,19 @@ export class Stage {
     if (right.lengthSq() < 1e-6) right.set(1, 0, 0).addScaledVector(out, -out.x);
     right.normalize();
     return out.cross(right).multiplyScalar(way[1]).addScaledVector(right, way[0]);
+  }
+
+  /** Returns how the user sees a place. */
+  viewOf(place: Place): View {
+    const [right, up] = [this.across(place, [1, 0]), this.across(place, [0, 1])];
+    const hasRoom = (shaft: Vec3, lengthM: number): boolean => {
+      const { surface } = this;
+      if (!surface) return true;
+      const tipM = surface.displacementAt(place).clone().add(this.spot.set(...place.restM));
+      const radiusM = 0.1 * lengthM;
+      return surface.room(tipM.addScaledVector(new Vector3(...place.outward), radiusM), new Vector3(...shaft), lengthM, radiusM, 0.5) >= 0;
+    };
+    return { right: right.toArray(), up: up.toArray(), hasRoom };
   }
 
   /** Returns the present window position of a place. */

@@ -1,10 +1,8 @@
 // A tool as drawn: a probe whose tip rests on the tissue, its depth below the surface at rest, and the force on it.
 
 import {
-  ConeGeometry,
   CylinderGeometry,
   Group,
-  type Material,
   Mesh,
   MeshBasicMaterial,
   RingGeometry,
@@ -12,7 +10,8 @@ import {
   Vector3,
 } from "three";
 import { light, SHADOWS, Steel } from "./material";
-import { norm, type Vec3 } from "palpate";
+import type { Vec3 } from "palpate";
+import { ForceArrow } from "./force-arrow";
 import type { Place, Surface } from "./surface";
 
 /** A tool in the state of the server's sample. */
@@ -53,8 +52,8 @@ const BESIDE_EYE = [[0.25, 0], [-0.25, 0], [0, 0.25], [0, -0.25], [0.1, 0], [-0.
 const AROUND = 16;
 /** Where the dark part of a shaft begins and ends, in radii of the tip. In a tube it ends before the wall. */
 const HANDLE = { from: 6, to: 66 };
-/** Maximum length of the force arrow, relative to the tissue's size and to the available room. */
-const ARROW = { size: 0.26, room: 0.9 };
+/** Part of the available room that the shaft takes. */
+const ROOM = 0.9;
 const UP = new Vector3(0, 0, 1);
 
 export class ToolMark {
@@ -63,10 +62,8 @@ export class ToolMark {
   readonly tipM = new Vector3();
   private readonly axis = new Vector3(0, 0, 1);
   private readonly probe = new Group();
-  private readonly arrow = new Group();
+  private readonly arrow = new ForceArrow();
   private readonly handle: Mesh;
-  private readonly rod: Mesh;
-  private readonly head: Mesh;
   private readonly gauge: Mesh;
   private readonly foot: Mesh;
   private readonly level: Mesh;
@@ -77,7 +74,6 @@ export class ToolMark {
   private readonly aside = new Vector3();
   private isNew = true;
   private readonly moved = new Vector3();
-  private readonly force = new Vector3();
   private radiusM = 0;
   private lengthM = 0;
   private roomM = Infinity;
@@ -93,19 +89,12 @@ export class ToolMark {
     this.handle = new Mesh(handle, new Steel(0x40464f));
     this.handle.position.z = HANDLE.from;
     this.probe.add(this.handle);
-    const above = (colour: number, opacity: number): Material =>
-      new MeshBasicMaterial({ color: colour, depthTest: false, transparent: true, opacity });
-    const green = above(0x35d0ba, 1);
-    const white = above(0xffffff, 0.85);
-    this.rod = new Mesh(new CylinderGeometry(0.2, 0.2, 1, 12).rotateX(Math.PI / 2).translate(0, 0, 0.5), green);
-    this.head = new Mesh(new ConeGeometry(0.62, 1.7, 20).rotateX(Math.PI / 2).translate(0, 0, -0.85), green);
-    this.arrow.add(this.rod, this.head);
+    const white = new MeshBasicMaterial({ color: 0xffffff, depthTest: false, transparent: true, opacity: 0.85 });
     this.gauge = new Mesh(new CylinderGeometry(0.12, 0.12, 1, 8).rotateX(Math.PI / 2).translate(0, 0, -0.5), white);
     this.level = new Mesh(new RingGeometry(1.7, 1.86, 48), white);
-    for (const part of [this.rod, this.head]) part.renderOrder = 3;
     this.foot = new Mesh(new SphereGeometry(0.26, 12, 8), white);
     for (const part of [this.gauge, this.foot, this.level]) part.renderOrder = 2;
-    this.group.add(this.probe, this.arrow, this.gauge, this.foot, this.level);
+    this.group.add(this.probe, this.arrow.group, this.gauge, this.foot, this.level);
   }
 
   hide(): void {
@@ -137,21 +126,8 @@ export class ToolMark {
     const whole = HANDLE.to * r;
     const free = surface.edge ? whole : whole + Math.min(0, surface.room(this.tipM, this.axis, whole, r, 0));
     this.lengthM = Math.min(this.lengthM, free);
-    this.handle.scale.z = Math.max((ARROW.room * free) / r - HANDLE.from, 0.01) / (HANDLE.to - HANDLE.from);
-    const strength = norm(tool.forceN);
-    const acts = tool.part > 1e-3 && strength > 0;
-    this.arrow.visible = acts;
-    if (acts) {
-      this.force.set(...tool.forceN).divideScalar(strength);
-      let long = near * Math.min(tool.part, 1.2) * ARROW.size * size + 2.4 * r;
-      // Inside a tube it ends before the wall.
-      if (!surface.edge) long = Math.max(ARROW.room * (long + Math.min(0, surface.room(this.tipM, this.force, long, r, 0))), 3 * r);
-      this.arrow.position.copy(this.tipM);
-      this.arrow.quaternion.setFromUnitVectors(UP, this.force);
-      this.rod.scale.set(r, r, long - 1.5 * r);
-      this.head.position.z = long;
-      this.head.scale.setScalar(r);
-    }
+    this.handle.scale.z = Math.max((ROOM * free) / r - HANDLE.from, 0.01) / (HANDLE.to - HANDLE.from);
+    this.arrow.show(this.tipM, tool.forceN, tool.part, surface, r, near * size);
     const out = moved.dot(this.out);
     const deep = Math.abs(out) > 0.8 * r;
     this.level.visible = deep;

@@ -215,7 +215,7 @@ export class Server {
 
 /**
  * @typedef {{
- *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[],
+ *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[], ownForcesN: number[],
  *   clear: number | undefined, cameraHeight: number, widthM: number, drawing: { isDrawn: boolean, isTextured: boolean, hasTexture: boolean },
  *   recording: { sessionId: string, run: number, begin: number, end: number, step: number, isPlaying: boolean, isBusy: boolean, speed: number, playback: string } | undefined,
  *   camera: number[],

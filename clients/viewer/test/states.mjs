@@ -66,6 +66,17 @@ const STATES = {
     await pressed(page, "tip");
     return { page };
   },
+  grasper: async (context) => {
+    const page = await shown(context, "?scene=gallbladder&name=Ann");
+    await page.page.check("input[value=grasper]", { force: true });
+    const [left, top] = await page.press(0.42, 0.5);
+    await page.until(({ ownForcesN }) => ownForcesN.filter((forceN) => forceN > 1e-3).length >= 2);
+    await page.page.mouse.down({ button: "right" });
+    await page.says("touch", /jaws/);
+    await page.page.mouse.move(left + 20, top - 40, { steps: 6 });
+    await page.page.waitForTimeout(2500);
+    return { page };
+  },
   lumps: async (context) => {
     const page = await shown(context, "");
     await page.page.check("#lumps");

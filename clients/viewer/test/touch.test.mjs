@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, describe, test } from "node:test";
-import { Page, pages, paper, Server } from "./harness.mjs";
+import { cut, Page, pages, paper, Server } from "./harness.mjs";
 import { Lossy } from "./lossy.mjs";
 
 const { open, close, context } = pages({ width: 820, height: 540 });
@@ -104,5 +104,85 @@ describe("touch", () => {
       await close(page);
     }
     assert.equal(await without.stop(), 0);
+  });
+
+  /** Presses with a grasper, closes it, and lifts what it holds. @param {Page} page */
+  const lift = async (page) => {
+    await page.page.check("input[value=grasper]");
+    const [left, top] = await page.press(0.45, 0.5);
+    // Both jaws touch.
+    await page.until(({ ownForcesN }) => ownForcesN.filter((forceN) => forceN > 1e-3).length >= 2);
+    assert.doesNotMatch(await page.text("felt"), /jaws/);
+    await page.page.mouse.down({ button: "right" });
+    await page.says("touch", /deep.*jaws [−\d.]+ [mµ]?N·m/s);
+    await page.page.mouse.move(left + 20, top - 60, { steps: 6 });
+    await page.until(({ largestM }) => largestM > 0.005);
+  };
+
+  test("leads a grasper by several tools, whose jaws hold what they close on", async () => {
+    const page = await open(`${server.url}/?scene=liver`);
+    await lift(page);
+    await page.says("touch", /lifted/);
+    await page.says("holder", /hold the tool/);
+    await page.picture("grasper");
+    // Open jaws let go, and touch again.
+    await page.page.mouse.up({ button: "right" });
+    await page.until(({ largestM, ownForcesN }) => largestM < 0.004 && ownForcesN.filter((forceN) => forceN > 1e-3).length >= 2);
+    assert.doesNotMatch(await page.text("felt"), /jaws/);
+    await page.page.mouse.wheel(0, 200);
+    await page.says("felt", /jaws/);
+    await page.page.mouse.up();
+    await page.until(({ largestM, forceN }) => largestM < 1e-4 && forceN.length === 0);
+    // By keys.
+    await page.page.focus("#tissue");
+    await page.page.keyboard.down(" ");
+    await page.until(({ ownForcesN }) => ownForcesN.filter((forceN) => forceN > 1e-3).length >= 2);
+    await page.page.keyboard.press("c");
+    await page.says("felt", /jaws/);
+    await page.page.keyboard.press("c");
+    await page.says("jaws-value", /52°/);
+    await page.page.keyboard.up(" ");
+    // The tip is one of its tools.
+    await page.page.check("input[value=tip]");
+    await page.press(0.5, 0.5);
+    await page.until(({ forceN, ownForcesN }) => forceN[0] > 1e-3 && ownForcesN.length === 1);
+    await page.page.mouse.up();
+    assert.equal(await page.page.locator("#notice").isVisible(), false);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("leads a grasper by calls, and on a mesh", async () => {
+    const bare = await context();
+    await bare.addInitScript("delete window.WebTransport");
+    const page = await Page.open(bare, `${server.url}/?scene=gallbladder`);
+    await lift(page);
+    await page.page.mouse.up({ button: "right" });
+    await page.page.mouse.up();
+    await page.until(({ largestM, forceN }) => largestM < 1e-4 && forceN.length === 0);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("closes the jaws of a grasper by a second finger, which does not turn the view", async () => {
+    const page = await open(`${server.url}/?scene=liver&tool=grasper`, { hasTouch: true, viewport: { width: 390, height: 844 } });
+    const camera = await page.ask(({ camera }) => camera);
+    const fingers = await page.page.context().newCDPSession(page.page);
+    const [x, y] = await page.at(0.5, 0.5);
+    /** @param {"touchStart" | "touchMove" | "touchEnd"} type @param {[number, number][]} at */
+    const touch = (type, ...at) => fingers.send("Input.dispatchTouchEvent", { type, touchPoints: at.map(([x, y], id) => ({ x, y, id })) });
+    await touch("touchStart", [x, y]);
+    await page.until(({ ownForcesN }) => ownForcesN.filter((forceN) => forceN > 1e-3).length >= 2);
+    await touch("touchStart", [x, y], [x + 120, y]);
+    for (let k = 1; k <= 5; k++) await touch("touchMove", [x, y], [x + 120 - 18 * k, y]);
+    await page.says("touch", /jaws/);
+    for (let k = 1; k <= 5; k++) await touch("touchMove", [x, y - 9 * k], [x + 30, y - 9 * k]);
+    await page.says("touch", /lifted/);
+    assert.deepEqual(await cut(page), []);
+    assert.deepEqual(await page.ask(({ camera }) => camera), camera);
+    await touch("touchEnd");
+    await page.until(({ largestM, forceN }) => largestM < 1e-4 && forceN.length === 0);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
   });
 });
