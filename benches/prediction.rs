@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use links::{by_seed, link, links, number};
-use palpate_haptics::{Predictor, Tip};
+use palpate_haptics::{Instrument, InstrumentPose, Predictor, Tip};
 use palpate_proto::pb;
 use palpate_session::tissue_copy::TissueCopy;
 use palpate_tissue::limits::Limits;
@@ -226,7 +226,7 @@ fn cost(report: &mut BenchReport) {
         let at = |part: f64| times_us[((times_us.len() - 1) as f64 * part) as usize];
         let snapshot = runtime.block_on(snapshot(&server, name));
         let began = Instant::now();
-        drop(palpate_session::journal::prediction(&snapshot, Tip::default()).unwrap());
+        drop(palpate_session::journal::prediction(&snapshot, &Instrument::of_tip(Tip::default())).unwrap());
         let made_ms = 1e3 * began.elapsed().as_secs_f64();
         let (points, megabytes) = (model.shape().point_count(), 1e-6 * snapshot.len() as f64);
         let values = [at(0.5), at(0.99), at(1.0), megabytes, made_ms];
@@ -256,7 +256,7 @@ fn times_us(model: &Arc<Model>) -> Vec<f64> {
         let stroke_m = 0.008 * (3.0 * (time_s - 0.2).max(0.0)).sin();
         let place_m: DVec3 = at_m - depth_m * outward + stroke_m * along;
         let began = Instant::now();
-        std::hint::black_box(copy.feel(time_s, place_m, &[]));
+        std::hint::black_box(copy.feel(time_s, &InstrumentPose::at(place_m), &[]));
         1e6 * began.elapsed().as_secs_f64()
     });
     // From when it touches on.

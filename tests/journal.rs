@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use journal_opening::opening;
-use palpate_haptics::Tip;
+use palpate_haptics::{Instrument, Tip};
 use palpate_refusal::Reason;
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};
@@ -416,7 +416,7 @@ fn a_copy_for_a_client_is_bounded_whatever_a_server_sends() {
     let copy = |sets: &[&str]| {
         let model = model(sets);
         let radius_m = 2.0 * model.shape().edge_m();
-        palpate_session::journal::prediction(&snapshot_bytes(&model, radius_m), tip)
+        palpate_session::journal::prediction(&snapshot_bytes(&model, radius_m), &Instrument::of_tip(tip))
     };
     let refused = |sets: &[&str], why: &str| {
         let said = copy(sets).err().unwrap();

@@ -54,6 +54,7 @@ pub async fn big_law(ground: &Ground) -> Result<(), Status> {
             max_stiffness_n_per_m: 2000.0,
             max_damping_n_s_per_m: 10.0,
             workspace_radius_m: 1.0,
+            max_torque_n_m: 0.0,
         };
         let open = pb::TouchOpen { session_id: session_id.clone(), device: Some(device), ..Default::default() };
         let say = tokio_stream::once(pb::TouchRequest { message: Some(Say::Open(open)) });

@@ -491,6 +491,7 @@ pub fn datagram(bytes: &[u8]) -> bool {
     let Ok(message) = pb::PosesDatagram::decode(bytes) else { return from_server };
     let commands: Vec<pb::Command> = message.tools.iter().flat_map(of_touch::commands).collect();
     assert!(commands.len() <= message.tools.len() * (1 + of_touch::MAX_EARLIER));
+    let to_instruments: Vec<pb::Command> = of_touch::instrument_commands(&message).collect();
     let mut intake = Intake::new(&model().scene, &limits());
     intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
     let mut session = Session::new(model());
@@ -499,6 +500,10 @@ pub fn datagram(bytes: &[u8]) -> bool {
         // One by one, as the server does: a late one does not cause the others to be refused.
         let Ok(command) = wire::command::from_command(command, model().scene.shape(), 1) else { continue };
         taken |= intake.submit(1, vec![Command { by_datagram: true, ..command }], 1).is_ok();
+    }
+    for command in &to_instruments {
+        let Ok(commands) = commands_of(command, model().scene.shape()) else { continue };
+        taken |= intake.submit(1, commands, 1).is_ok();
     }
     let mut due = Vec::new();
     for _ in 0..3 {
@@ -522,13 +527,28 @@ fn datagram_seeds() -> Vec<Vec<u8>> {
         let all: Vec<_> = (0..9).rev().map(|sequence| posed(sequence, moves)).collect();
         of_touch::tool_poses(tool, &all[0], all[1..].iter())
     };
-    let datagram = |tools| pb::PosesDatagram { number: 9, acknowledges: 7, heartbeat_s: 0.04, tools, sent_ns: 1 << 40 };
+    let instruments = vec![pb::PosedInstrument {
+        tool: 0,
+        sequence: 20,
+        client_time_ns: 30_000_000,
+        pose: Some(instrument::pose(&InstrumentPose::at(DVec3::new(0.1, 0.1, 0.01)))),
+    }];
+    let with = |tools, instruments| pb::PosesDatagram {
+        number: 9,
+        acknowledges: 7,
+        heartbeat_s: 0.04,
+        tools,
+        sent_ns: 1 << 40,
+        instruments,
+    };
+    let datagram = |tools| with(tools, Vec::new());
     let sample = pb::Sample { step: 5, tools: vec![pb::ToolSample::default()], ..Default::default() };
     let answer =
         pb::SampleDatagram { number: 7, acknowledges: 9, heartbeat_s: 0.0125, sample: Some(sample), sent_ns: 1 << 41 };
     vec![
         datagram(vec![poses(0, false)]).encode_to_vec(),
         datagram(vec![poses(0, true), poses(2, false)]).encode_to_vec(),
+        with(Vec::new(), instruments).encode_to_vec(),
         answer.encode_to_vec(),
     ]
 }

@@ -581,7 +581,7 @@ pub struct TouchOpen {
     /// waiting for the samples of its own tool.
     #[prost(bool, tag = "13")]
     pub other_tools: bool,
-    /// Instruments whose tips are tools of this stream. Their poses go by the stream, not by datagram.
+    /// Instruments whose tips are tools of this stream.
     #[prost(message, repeated, tag = "14")]
     pub instruments: ::prost::alloc::vec::Vec<Instrument>,
 }
@@ -647,6 +647,9 @@ pub struct PosesDatagram {
     /// Time of the client's own clock, of any origin, when this was sent.
     #[prost(fixed64, tag = "5")]
     pub sent_ns: u64,
+    /// The poses of instruments that may not have arrived, oldest first.
+    #[prost(message, repeated, tag = "6")]
+    pub instruments: ::prost::alloc::vec::Vec<PosedInstrument>,
 }
 impl ::prost::Name for PosesDatagram {
     const NAME: &'static str = "PosesDatagram";
@@ -656,6 +659,30 @@ impl ::prost::Name for PosesDatagram {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.PosesDatagram".into()
+    }
+}
+/// A pose of an instrument.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct PosedInstrument {
+    /// Its first tool.
+    #[prost(uint32, tag = "1")]
+    pub tool: u32,
+    /// As in `Command`; sequence and time are both required.
+    #[prost(uint64, tag = "2")]
+    pub sequence: u64,
+    #[prost(fixed64, tag = "3")]
+    pub client_time_ns: u64,
+    #[prost(message, optional, tag = "4")]
+    pub pose: ::core::option::Option<InstrumentPose>,
+}
+impl ::prost::Name for PosedInstrument {
+    const NAME: &'static str = "PosedInstrument";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.PosedInstrument".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.PosedInstrument".into()
     }
 }
 /// The newest pose of a tool, and some earlier ones, which may have been lost.
@@ -830,6 +857,9 @@ pub struct Device {
     /// Radius of the workspace around the top of the tissue (Extent.top_m): a pose farther away is refused.
     #[prost(double, tag = "6")]
     pub workspace_radius_m: f64,
+    /// Largest torque, N\*m, at most 100; 0 if it renders none.
+    #[prost(double, tag = "7")]
+    pub max_torque_n_m: f64,
 }
 impl ::prost::Name for Device {
     const NAME: &'static str = "Device";
@@ -1180,6 +1210,12 @@ pub struct InstrumentSample {
     /// What keeps the instrument in balance in its port. Absent without a port.
     #[prost(message, optional, tag = "7")]
     pub port_load: ::core::option::Option<PortLoad>,
+    /// The client's time at which the instrument was there; 0 if its poses have none.
+    #[prost(fixed64, tag = "8")]
+    pub client_time_ns: u64,
+    /// The angle between the jaws at this step.
+    #[prost(double, tag = "9")]
+    pub jaw_rad: f64,
 }
 impl ::prost::Name for InstrumentSample {
     const NAME: &'static str = "InstrumentSample";

@@ -22,6 +22,9 @@ pub const MAX_BYTES: usize = 1024;
 /// Maximum number of earlier poses of a tool beside its newest in a datagram.
 pub const MAX_EARLIER: usize = 8;
 
+/// Largest number of earlier poses of an instrument in a datagram: they are sent whole.
+pub const MAX_EARLIER_OF_INSTRUMENT: usize = 3;
+
 /// Bytes that may be in flight: a second of 1 kHz at 250 bytes.
 const WINDOW_BYTES: u64 = 256 << 10;
 
@@ -121,6 +124,19 @@ pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &
     }
 }
 
+/// Returns the commands to instruments in a datagram, oldest first. Leaves out those without a pose.
+pub fn instrument_commands(message: &pb::PosesDatagram) -> impl Iterator<Item = pb::Command> {
+    message.instruments.iter().filter_map(|posed| {
+        Some(pb::Command {
+            tool: posed.tool,
+            sequence: Some(posed.sequence),
+            client_time_ns: posed.client_time_ns,
+            action: Some(pb::command::Action::Instrument(posed.pose?)),
+            ..Default::default()
+        })
+    })
+}
+
 /// Returns the commands in a message, oldest first: the earlier poses, at most [`MAX_EARLIER`] and without velocity,
 /// then the newest. Leaves out earlier poses whose number or time would be below 0; empty without a newest pose.
 pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
@@ -167,6 +183,7 @@ mod tests {
             heartbeat_s: 0.04,
             sent_ns: 1 << 60,
             tools: vec![message.clone()],
+            instruments: Vec::new(),
         };
         assert!(prost::Message::encoded_len(&datagram) < 400, "{}", prost::Message::encoded_len(&datagram));
         let commands: Vec<pb::Command> = commands(&message).collect();

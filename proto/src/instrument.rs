@@ -4,7 +4,9 @@ use glam::DQuat;
 use palpate_haptics::instrument::MAX_TIPS;
 use palpate_haptics::instrument_pose::MAX_JAW_RAD;
 use palpate_haptics::port::HANDLE_M;
-use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Port};
+use palpate_haptics::{
+    Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Port, Wrench, WrenchSample,
+};
 
 use crate::geometry::{from_vector, vector};
 use crate::pb;
@@ -146,6 +148,26 @@ pub fn pose(pose: &InstrumentPose) -> pb::InstrumentPose {
         orientation: orientation(pose.orientation),
         jaw_rad: pose.jaw_rad,
         ..Default::default()
+    }
+}
+
+/// Returns what a client renders of an instrument's sample, which is of a `step`. Checks nothing: a value that is not finite is refused
+/// by [`palpate_haptics::InstrumentRenderer::receive`].
+#[allow(clippy::cast_precision_loss)]
+pub fn from_sample(message: &pb::InstrumentSample, step: u64) -> WrenchSample {
+    let orientation = message.orientation.as_ref();
+    WrenchSample {
+        sequence: step,
+        client_time_s: message.client_time_ns as f64 * 1e-9,
+        pose: InstrumentPose {
+            place_m: from_vector(message.about_m.as_ref()),
+            orientation: orientation.map_or(DQuat::IDENTITY, |turn| DQuat::from_xyzw(turn.x, turn.y, turn.z, turn.w)),
+            jaw_rad: message.jaw_rad,
+        },
+        wrench: Wrench {
+            force_n: from_vector(message.force_on_tool_n.as_ref()),
+            torque_n_m: from_vector(message.torque_on_tool_n_m.as_ref()),
+        },
     }
 }
 

@@ -12,7 +12,7 @@ use palpate_refusal::{self as refusal, Reason, Refusal, Result, number};
 ///
 /// # Errors
 /// Refuses a name of more than 128 bytes or with control characters, and a limit that is not above 0 or beyond its
-/// range: forces to 1000 N, stiffness to 10⁶ N/m, damping to 10⁴ N·s/m, the workspace's radius to 10 m.
+/// range: forces to 1000 N, stiffness to 10⁶ N/m, damping to 10⁴ N·s/m, the workspace's radius to 10 m. Refuses a torque that is negative or above 100 N·m.
 pub fn from_device(message: &pb::Device) -> Result<Device> {
     refusal::label("device.name", &message.name)?;
     let within = |field: &str, value: f64, most: f64| {
@@ -26,6 +26,9 @@ pub fn from_device(message: &pb::Device) -> Result<Device> {
         stiffness_n_per_m: within("max_stiffness_n_per_m", message.max_stiffness_n_per_m, 1e6)?,
         damping_n_s_per_m: within("max_damping_n_s_per_m", message.max_damping_n_s_per_m, 1e4)?,
         workspace_m: within("workspace_radius_m", message.workspace_radius_m, 10.0)?,
+        torque_n_m: number("device.max_torque_n_m", message.max_torque_n_m, "from 0 to 100", |v| {
+            (0.0..=100.0).contains(&v)
+        })?,
     })
 }
 
@@ -38,6 +41,7 @@ pub fn device(device: &Device) -> pb::Device {
         max_stiffness_n_per_m: device.stiffness_n_per_m,
         max_damping_n_s_per_m: device.damping_n_s_per_m,
         workspace_radius_m: device.workspace_m,
+        max_torque_n_m: device.torque_n_m,
     }
 }
 

@@ -2,7 +2,8 @@
  *
  * LOG is the file that gets what is asked of it. What goes wrong is chosen when it is compiled: NO_DEVICE, VERSION=2,
  * UNPLUGGED (while it is pressed), SATURATED (the returns 1 and 2, which are no errors), GARBAGE=NAN (positions that are
- * not numbers, from then on, or 1e9; PRESSED=51: at once), MISSING (a function). */
+ * not numbers, from then on, or 1e9; PRESSED=51: at once), MISSING (a function). With SIX_AXES it is a sigma.7, whose handle is
+ * turned by a quarter about its z axis. */
 #include <math.h>
 #include <stdio.h>
 
@@ -64,8 +65,34 @@ int dhdEnableForce(unsigned char on, char id) {
   return 0;
 }
 
+#ifdef SIX_AXES
+int dhdGetSystemType(char id) { return wrong(id) ? -1 : 104; }
+const char *dhdGetSystemName(char id) { return wrong(id) ? NULL : "sigma.7"; }
+
+int dhdGetOrientationFrame(double rows[3][3], char id) {
+  static const double turned[3][3] = {{0, -1, 0}, {1, 0, 0}, {0, 0, 1}};
+  if (wrong(id)) return fail("invalid device");
+  for (int row = 0; row < 3; row++)
+    for (int column = 0; column < 3; column++) rows[row][column] = turned[row][column];
+  return 0;
+}
+
+int dhdGetGripperAngleRad(double *angle, char id) {
+  if (wrong(id)) return fail("invalid device");
+  *angle = 0.4;
+  return 0;
+}
+
+int dhdSetForceAndTorque(double x, double y, double z, double tx, double ty, double tz, char id) {
+  if (wrong(id)) return fail("invalid device");
+  fprintf(file, "force %.17g %.17g %.17g\n", x, y, z);
+  fprintf(file, "torque %.17g %.17g %.17g\n", tx, ty, tz);
+  return 0;
+}
+#else
 int dhdGetSystemType(char id) { return wrong(id) ? -1 : 33; }
 const char *dhdGetSystemName(char id) { return wrong(id) ? NULL : "omega.3"; }
+#endif
 double dhdGetMaxForce(char id) { return wrong(id) ? 0.0 : 9.0; }
 
 int dhdSetMaxForce(double force_n, char id) {

@@ -87,6 +87,15 @@ void hdGetDoublev(unsigned int name, double *to) {
 #endif
       break;
     }
+    case 0x2052: {
+      /* By columns: the stylus is turned by a quarter about its y axis, so that it points to the left. */
+      const double turned[16] = {0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
+      memcpy(to, turned, sizeof turned);
+      break;
+    }
+#ifdef SIX_AXES
+    case 0x2622: *to = 170.0; break;
+#endif
     case 0x2550: {
       const double box[6] = {-200, -100, -70, 200, 300, 200};
       memcpy(to, box, sizeof box);
@@ -111,6 +120,12 @@ void hdGetIntegerv(unsigned int name, int *to) {
 }
 
 void hdSetDoublev(unsigned int name, const double *from) {
+#ifdef SIX_AXES
+  if (name == 0x2701 && framed) {
+    fprintf(file, "torque %.17g %.17g %.17g\n", from[0], from[1], from[2]);
+    return;
+  }
+#endif
   if (name != 0x2700 || !framed) {
     fail(0x0102);
     return;

@@ -323,7 +323,7 @@ fn poses(number: u64, tool: u32, sequence: u64) -> Vec<u8> {
     let Some(pb::command::Action::Pose(pose)) = command.action else { panic!() };
     let newest = datagram::Posed { sequence, client_time_ns: command.client_time_ns, pose };
     let tools = vec![datagram::tool_poses(tool, &newest, [].iter())];
-    pb::PosesDatagram { number, acknowledges: 0, heartbeat_s: 0.0, tools, sent_ns: 0 }.encode_to_vec()
+    pb::PosesDatagram { number, tools, ..Default::default() }.encode_to_vec()
 }
 
 #[tokio::test]

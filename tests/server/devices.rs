@@ -14,12 +14,12 @@ use std::time::Duration;
 
 use crate::common::inverse_service::{InverseService, Wrong};
 use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository};
-use glam::DVec3;
-use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, run};
+use glam::{DQuat, DVec3};
+use palpate_client::bridge::{BridgeReport, Copies, Options, SessionChoice, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
 use palpate_client::{Credentials, HapticDevice, Reading};
 use palpate_haptics::device::SAFE_FORCE_N;
-use palpate_haptics::{Device, RenderingState, Tip};
+use palpate_haptics::{Device, Instrument, RenderingState, Tip, Wrench};
 
 /// The middle of the scene `liver`.
 const MIDDLE_M: DVec3 = DVec3::new(0.0375, 0.0375, 0.0);
@@ -106,6 +106,122 @@ async fn touch(
 struct Noting<D> {
     device: D,
     noted: Arc<Mutex<(DVec3, Vec<DVec3>)>>,
+}
+
+/// A device of six axes that records the wrenches that it was given.
+struct NotingWrenches<D> {
+    device: D,
+    noted: Arc<Mutex<Vec<Wrench>>>,
+}
+
+impl<D: HapticDevice> HapticDevice for NotingWrenches<D> {
+    fn descriptor(&self) -> Device {
+        self.device.descriptor()
+    }
+
+    fn read(&mut self) -> std::io::Result<Reading> {
+        self.device.read()
+    }
+
+    fn write(&mut self, _: DVec3) -> std::io::Result<()> {
+        panic!("an instrument has a wrench");
+    }
+
+    fn orientation(&self) -> DQuat {
+        self.device.orientation()
+    }
+
+    fn jaw_rad(&self) -> f64 {
+        self.device.jaw_rad()
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> std::io::Result<()> {
+        self.noted.lock().unwrap().push(wrench);
+        self.device.write_wrench(wrench)
+    }
+}
+
+/// Leads a shaft of 16 mm on `liver` by a device until it has felt a torque of 0.1 mN·m for some ticks. Returns what the loop asked of
+/// it, with the results.
+async fn lead_shaft(device: Box<dyn HapticDevice>, server: &TestServer) -> (Vec<Wrench>, BridgeReport) {
+    let tip = Tip { radius_m: 0.004, ..Tip::default() };
+    let mut instrument = Instrument::default();
+    instrument.add_parts(None, Some((0.016, tip)));
+    let copies = Some(Copies { make: Arc::new(palpate_session::journal::prediction), of_grids: true });
+    let noted = Arc::new(Mutex::new(Vec::new()));
+    let device = NotingWrenches { device, noted: noted.clone() };
+    let options = Options { remembers: true, copies, instrument: Some(instrument), ..Options::default() };
+    let felt = noted.clone();
+    let stop = async move {
+        let is_felt = || felt.lock().unwrap().iter().filter(|wrench| wrench.torque_n_m.length() > 1e-4).count() > 50;
+        while !is_felt() {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    let serving = run(device, target(server), options, stop);
+    let (device, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("no torque").unwrap();
+    drop(device);
+    assert_eq!(report.traffic.refused, 0);
+    assert!(report.predicted_ticks > 0 && report.most_torque_n_m > 1e-4);
+    let noted = noted.lock().unwrap().clone();
+    (noted, report)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_of_six_axes_gets_force_and_torque_in_its_own_axes() {
+    let server = TestServer::start(&[]);
+    let imitation = Imitation::build("dhd", &["SIX_AXES"]);
+    let mut device = open("force-dimension", Some(&imitation.library)).unwrap();
+    let limits = device.descriptor();
+    assert_eq!((limits.name, limits.torque_n_m), ("sigma7", 0.4));
+    device.read().unwrap();
+    // The base's x is towards the operator and its y to the right. A quarter turn has the handle, which points away along the base's
+    // −x, point along its −y, to the left.
+    assert!((device.orientation() * DVec3::X).distance(DVec3::NEG_X) < 1e-12);
+    assert!((device.orientation() * DVec3::Z).distance(DVec3::Z) < 1e-12 && device.jaw_rad() == 0.4);
+    let (asked, _) = lead_shaft(device, &server).await;
+    let (forces, torques) = (imitation.log.vectors("force"), imitation.log.vectors("torque"));
+    let to_base = |v: DVec3| DVec3::new(-v.y, v.x, v.z);
+    // One without torque at the opening, and one of zeros when it is closed.
+    assert_eq!((forces.len(), torques.len()), (asked.len() + 2, asked.len() + 1));
+    for (index, wrench) in asked.iter().enumerate() {
+        assert!(near(forces[index + 1], to_base(wrench.force_n)), "{index}");
+        assert!(near(torques[index], to_base(wrench.torque_n_m)), "{index}");
+        assert!(wrench.torque_n_m.length() <= limits.most_n_m() + 1e-12);
+    }
+    // The shaft lies to the right of the tip, so what presses it up turns it about the axis away from the operator, to the left.
+    let most = asked.iter().max_by(|a, b| a.torque_n_m.length().total_cmp(&b.torque_n_m.length())).unwrap();
+    assert!(most.force_n.z > 0.0 && most.torque_n_m.y < -1e-4, "{most:?}");
+    assert!(most.torque_n_m.y.abs() > 5.0 * most.torque_n_m.z.abs(), "{most:?}");
+    assert_eq!((asked.last(), torques.last()), (Some(&Wrench::default()), Some(&DVec3::ZERO)));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_phantom_gets_torque_in_millinewton_metres_and_none_when_the_loop_stands_still() {
+    let server = TestServer::start(&[]);
+    let imitation = Imitation::build("hd", &["SIX_AXES"]);
+    let mut device = open("openhaptics", Some(&imitation.library)).unwrap();
+    assert!((device.descriptor().torque_n_m - 0.17).abs() < 1e-15);
+    device.read().unwrap();
+    // The stylus points to the left: its −z after a quarter turn about y.
+    assert!((device.orientation() * DVec3::X).distance(DVec3::NEG_X) < 1e-12, "{}", device.orientation());
+    let (asked, _) = lead_shaft(device, &server).await;
+    let torques = imitation.log.vectors("torque");
+    let to_library = |v: DVec3| 1e3 * DVec3::new(v.x, v.z, -v.y);
+    assert!(torques.iter().filter(|torque| torque.length() > 0.1).count() > 10);
+    for torque in &torques {
+        let is_asked = asked.iter().any(|wrench| near(to_library(wrench.torque_n_m), *torque));
+        assert!(*torque == DVec3::ZERO || is_asked, "{torque}");
+    }
+    assert_eq!(torques.last(), Some(&DVec3::ZERO));
+    let imitation = Imitation::build("hd", &["SIX_AXES"]);
+    let mut device = open("openhaptics", Some(&imitation.library)).unwrap();
+    device.write_wrench(Wrench { force_n: DVec3::ZERO, torque_n_m: DVec3::new(0.01, 0.02, 0.03) }).unwrap();
+    let set = DVec3::new(10.0, 30.0, -20.0);
+    until("no torque", || {
+        let torques = imitation.log.vectors("torque");
+        torques.last() == Some(&DVec3::ZERO) && torques.iter().any(|torque| near(*torque, set))
+    });
 }
 
 impl<D: HapticDevice> HapticDevice for Noting<D> {

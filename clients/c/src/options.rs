@@ -181,6 +181,7 @@ impl palpate_limits {
             max_stiffness_n_per_m: self.max_stiffness_n_per_m,
             max_damping_n_s_per_m: self.max_damping_n_s_per_m,
             workspace_radius_m: self.workspace_radius_m,
+            max_torque_n_m: 0.0,
         };
         touch::from_device(&message).map_err(|refusal| CodedError::argument(refusal.to_string()))
     }

@@ -29,7 +29,7 @@ use std::time::{Duration, Instant};
 use palpate_haptics::datagram_health::{Carried, DatagramHealth, LIFE_S};
 use palpate_haptics::dead_reckoning::{FASTEST_S, SendInterval};
 use palpate_haptics::deadband::HEARTBEAT_S;
-use palpate_proto::datagram::{self, MAX_BYTES, MAX_EARLIER, Posed};
+use palpate_proto::datagram::{self, MAX_BYTES, MAX_EARLIER, MAX_EARLIER_OF_INSTRUMENT, Posed};
 use palpate_proto::pb;
 use prost::Message;
 use tokio::task::JoinSet;
@@ -65,6 +65,8 @@ pub struct Datagrams {
     life: Interval,
     /// For each tool its newest poses, newest first: they are sent again with the next one, in case they were lost.
     recent: BTreeMap<u32, VecDeque<Posed>>,
+    /// As `recent`, for each instrument by its first tool, oldest first.
+    recent_of_instruments: BTreeMap<u32, VecDeque<pb::PosedInstrument>>,
     wanted_s: f64,
     /// Owner's revision and step of the newest sample.
     newest: Option<(u64, u64)>,
@@ -90,6 +92,7 @@ impl Datagrams {
             begun: Instant::now(),
             life,
             recent: BTreeMap::new(),
+            recent_of_instruments: BTreeMap::new(),
             wanted_s: HEARTBEAT_S,
             newest: None,
         };
@@ -135,33 +138,49 @@ impl Datagrams {
     }
 
     /// Sends a pose that is played by the client's time (`client_time_ns` and `sequence` set, no `at_step`), together
-    /// with up to 8 earlier ones of its tool, in case these were lost. Never waits. Returns false if the stream must
+    /// with up to 8 earlier ones of its tool, 3 of an instrument, in case these were lost. Never waits. Returns false if the stream must
     /// carry the command: there is no session, datagrams do not get through at present, the message is too long for
     /// one datagram, or it is another command.
     pub fn send(&mut self, command: &pb::Command) -> bool {
-        let (Some(pb::command::Action::Pose(pose)), Some(sequence), None) =
-            (&command.action, command.sequence, command.at_step)
-        else {
+        let (Some(action), Some(sequence), None) = (&command.action, command.sequence, command.at_step) else {
             return false;
         };
         if self.connection.is_none() || command.client_time_ns == 0 {
             return false;
         }
+        let pose = match action {
+            pb::command::Action::Pose(pose) => pose,
+            pb::command::Action::Instrument(pose) => return self.send_instrument(command, sequence, pose),
+            _ => return false,
+        };
         let newest = Posed { sequence, client_time_ns: command.client_time_ns, pose: *pose };
         let recent = self.recent.entry(command.tool).or_default();
         let message = datagram::tool_poses(command.tool, &newest, recent.iter());
         recent.push_front(newest);
         recent.truncate(MAX_EARLIER);
         let now_s = self.now_s();
-        self.carrier.update(now_s) && self.datagram(vec![message], now_s)
+        self.carrier.update(now_s) && self.datagram(vec![message], Vec::new(), now_s)
+    }
+
+    fn send_instrument(&mut self, command: &pb::Command, sequence: u64, pose: &pb::InstrumentPose) -> bool {
+        let (tool, client_time_ns) = (command.tool, command.client_time_ns);
+        let recent = self.recent_of_instruments.entry(tool).or_default();
+        recent.push_back(pb::PosedInstrument { tool, sequence, client_time_ns, pose: Some(*pose) });
+        if recent.len() > 1 + MAX_EARLIER_OF_INSTRUMENT {
+            recent.pop_front();
+        }
+        let instruments = recent.iter().copied().collect();
+        let now_s = self.now_s();
+        self.carrier.update(now_s) && self.datagram(Vec::new(), instruments, now_s)
     }
 
     /// Sends a datagram. Returns false if it is too long or the session has ended.
-    fn datagram(&mut self, tools: Vec<pb::ToolPoses>, now_s: f64) -> bool {
+    fn datagram(&mut self, tools: Vec<pb::ToolPoses>, instruments: Vec<pb::PosedInstrument>, now_s: f64) -> bool {
         let Some(connection) = &self.connection else { return false };
         let (number, acknowledges) = self.carrier.send(now_s);
         let heartbeat_s = self.pulse.heartbeat_s(now_s) as f32;
-        let message = pb::PosesDatagram { number, acknowledges, heartbeat_s, tools, sent_ns: (now_s * 1e9) as u64 };
+        let sent_ns = (now_s * 1e9) as u64;
+        let message = pb::PosesDatagram { number, acknowledges, heartbeat_s, tools, sent_ns, instruments };
         let most = connection.max_datagram_size().map_or(0, |most| most.min(MAX_BYTES));
         message.encoded_len() <= most && connection.send_datagram(message.encode_to_vec()).is_ok()
     }
@@ -192,7 +211,7 @@ impl Datagrams {
                 _ = self.life.tick() => {
                     let now_s = self.now_s();
                     if self.connection.is_some() && self.carrier.is_silent(now_s) {
-                        self.datagram(Vec::new(), now_s);
+                        self.datagram(Vec::new(), Vec::new(), now_s);
                     }
                     // Detects that nothing is confirmed any longer, even while nothing is sent.
                     self.carrier.update(now_s);

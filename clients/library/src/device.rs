@@ -7,8 +7,8 @@
 //! hand. Convert the library's units and axes in your adapter. [`crate::devices`] has adapters for the devices of
 //! some makers, and can place a workspace elsewhere.
 
-use glam::DVec3;
-use palpate_haptics::Device;
+use glam::{DQuat, DVec3};
+use palpate_haptics::{Device, Wrench};
 
 use crate::bridge::Tick;
 
@@ -86,6 +86,23 @@ pub trait HapticDevice: Send {
     /// # Errors
     /// Returns an error if the force can't be set; it ends the loop.
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
+    /// Returns the orientation of the device's handle at the newest reading, of length 1: it turns vectors of an instrument's frame
+    /// ([`palpate_haptics::instrument`]) into the device's frame. By default not turned.
+    fn orientation(&self) -> DQuat {
+        DQuat::IDENTITY
+    }
+    /// Returns the angle of the device's gripper at the newest reading, rad, 0 while it is closed. By default 0.
+    fn jaw_rad(&self) -> f64 {
+        0.0
+    }
+    /// Sets force and torque to render until the next call, in the device's frame, acting on the hand; the torque is about the
+    /// device's position. Called in place of `write` while the device leads an instrument. By default writes the force alone.
+    ///
+    /// # Errors
+    /// Returns an error if they can't be set; it ends the loop.
+    fn write_wrench(&mut self, wrench: Wrench) -> std::io::Result<()> {
+        self.write(wrench.force_n)
+    }
     /// Returns the buttons that were pressed at the newest reading: bit n for button n. By default none is reported.
     fn buttons(&self) -> u32 {
         0
@@ -109,6 +126,18 @@ impl HapticDevice for Box<dyn HapticDevice> {
 
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
         (**self).write(force_n)
+    }
+
+    fn orientation(&self) -> DQuat {
+        (**self).orientation()
+    }
+
+    fn jaw_rad(&self) -> f64 {
+        (**self).jaw_rad()
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> std::io::Result<()> {
+        (**self).write_wrench(wrench)
     }
 
     fn buttons(&self) -> u32 {

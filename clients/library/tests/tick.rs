@@ -7,7 +7,9 @@ use std::cell::Cell;
 use glam::{DMat3, DVec3};
 use palpate_client::Reading;
 use palpate_client::bridge::{Offline, PositionOrigin};
-use palpate_haptics::{ContactState, Device, Law, LocalModel, OtherTool, Predicted, Predictor, RenderingState};
+use palpate_haptics::{
+    ContactState, Device, InstrumentPose, Law, LocalModel, OtherTool, Predicted, Predictor, RenderingState, Wrench,
+};
 use palpate_proto::{pb, touch};
 use pb::touch_response::Message as Heard;
 use prost::Message;
@@ -88,9 +90,11 @@ fn z_m(time_s: f64) -> f64 {
 struct SpringCopy(f64);
 
 impl Predictor for SpringCopy {
-    fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
+    fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
+        let place_m = pose.place_m;
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-        Some(Predicted { force_n: self.0 * (-place_m.z).max(0.0) * DVec3::Z, contact_state, own_work_j: 0.0 })
+        let wrench = Wrench::of_force(self.0 * (-place_m.z).max(0.0) * DVec3::Z);
+        Some(Predicted { wrench, contact_state, own_work_j: 0.0 })
     }
 }
 

@@ -6,7 +6,10 @@ use glam::DVec3;
 use palpate_client::HapticDevice;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run, two_hands};
 use palpate_client::devices::{self, DeviceKind, Placed, Placement};
-use palpate_haptics::{LimitCause, RenderingState, Tip, TipShape};
+use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::port::HANDLE_M;
+use palpate_haptics::{Instrument, LimitCause, Port, RenderingState, Tip, TipShape};
+use palpate_refusal::number;
 use palpate_refusal::printable::printable_json;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
@@ -59,6 +62,19 @@ pub(crate) struct BridgeArguments {
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
     radius_m: f64,
+    /// The device leads an instrument, by its position and orientation: jaws of this length, m, whose angle is that of the device's
+    /// gripper. Its tips have --tip and --radius-m, and are the tools from --tool on. Force and torque come from a copy of the tissue
+    #[arg(long, value_name = "M", conflicts_with_all = ["second_device", "up_deadband", "deadband"])]
+    jaws_m: Option<f64>,
+    /// The device leads an instrument with a shaft of this length, m, behind its jaws if it has any
+    #[arg(long, value_name = "M", conflicts_with_all = ["second_device", "up_deadband", "deadband"])]
+    shaft_m: Option<f64>,
+    /// The shaft of the instrument slides through this place, as through a trocar, m, in the tissue's frame
+    #[arg(long, value_name = "X,Y,Z", value_parser = vector, allow_hyphen_values = true)]
+    port_m: Option<DVec3>,
+    /// With --port-m: distance from the tip of the instrument to its handle, m
+    #[arg(long, value_name = "M", default_value_t = palpate_haptics::port::DEFAULT_HANDLE_M, requires = "port_m")]
+    handle_m: f64,
     /// The simulated hand that holds a simulated device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
@@ -99,6 +115,29 @@ pub(crate) struct BridgeArguments {
 /// Scale of the depths of the simulated hand's presses.
 const SCALE: f64 = 0.2;
 
+/// Returns the instrument that the device leads, if it leads one.
+fn instrument(arguments: &BridgeArguments, tip: Tip) -> Result<Option<Instrument>, ClientFailure> {
+    let length = |field: &str, value: Option<f64>| {
+        value.map(|m| number(field, m, "above 0 and at most 0.5", |m| m > 0.0 && m <= 0.5)).transpose()
+    };
+    let (jaws_m, shaft_m) = (length("--jaws-m", arguments.jaws_m)?, length("--shaft-m", arguments.shaft_m)?);
+    if jaws_m.is_none() && shaft_m.is_none() {
+        let Some(_) = arguments.port_m else { return Ok(None) };
+        return Err(ClientFailure::Refused("--port-m: needs --shaft-m or --jaws-m".to_owned()));
+    }
+    number("--radius-m", tip.radius_m, "above 0", |m| m > 0.0)?;
+    let range = format!("from {} to {}", HANDLE_M.start(), HANDLE_M.end());
+    let handle_m = number("--handle-m", arguments.handle_m, &range, |m| HANDLE_M.contains(&m))?;
+    let mut instrument = Instrument::default();
+    instrument.add_parts(jaws_m.map(|length_m| (length_m, tip)), shaft_m.map(|length_m| (length_m, tip)));
+    if instrument.tips.len() > MAX_TIPS {
+        let message = format!("has {} tips, above the limit of {MAX_TIPS}: one for each radius", instrument.tips.len());
+        return Err(ClientFailure::Refused(format!("the instrument: {message}")));
+    }
+    instrument.port = arguments.port_m.map(|place_m| Port { place_m, handle_m });
+    Ok(Some(instrument))
+}
+
 /// Opens the real device of a name, or makes a simulated one, whose hand moves by a stream of random numbers.
 fn device(arguments: &BridgeArguments, name: &str, stream: u64) -> Result<Box<dyn HapticDevice>, ClientFailure> {
     if DeviceKind::of(name).is_some() {
@@ -134,15 +173,18 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
         datagrams: !arguments.no_datagrams,
         holder: "palpate-client bridge".to_owned(),
     };
+    let instrument = instrument(arguments, target.tip)?;
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
     let lasts = lasts.map_err(|error| ClientFailure::Refused(format!("--seconds: {error}")))?;
     // Last, so that what is refused is refused before a device moves.
     let first = Placed::new(device(arguments, &arguments.device, 0)?, placement)?;
     let remembers = arguments.course.is_some();
     let options = |hand| {
-        let (warn, copies) = (Some(Box::new(warn) as Warn), arguments.prediction.copies());
-        let keeps_session = arguments.keep_session;
-        Options { lasts, remembers, keeps_session, warn, copies, hand, ..Options::default() }
+        // Force and torque on an instrument come from a copy of any tissue.
+        let prediction = if instrument.is_some() { When::Always } else { arguments.prediction };
+        let (warn, copies) = (Some(Box::new(warn) as Warn), prediction.copies());
+        let (keeps_session, instrument) = (arguments.keep_session, instrument.clone());
+        Options { lasts, remembers, keeps_session, warn, copies, hand, instrument, ..Options::default() }
     };
     let (served, second) = match &arguments.second_device {
         None => (run(first, target, options(None), interrupted()).await?.1, None),
@@ -195,7 +237,7 @@ fn as_json(served: &BridgeReport, session_id: Option<&str>) -> serde_json::Value
         "failed_attempts": traffic.failed, "poses": traffic.poses, "datagrams_up": traffic.carried.sent,
         "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
         "tick_lateness_us": { "p50": p50_us, "p99": p99_us, "max": max_us },
-        "predicted_ticks": served.predicted_ticks, "largest_force_n": served.most_force_n,
+        "predicted_ticks": served.predicted_ticks, "largest_force_n": served.most_force_n, "largest_torque_n_m": served.most_torque_n_m,
         "largest_displacement_m": traffic.deepest_m, "session_id": session_id,
     });
     if let Some(envelope) = &served.envelope {
@@ -226,6 +268,7 @@ fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
         ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
         ("lateness of ticks p50 / p99 / max", format!("{p50_us:.0} / {p99_us:.0} / {max_us:.0} µs")),
         ("largest force", table::with_unit(served.most_force_n, "N")),
+        ("largest torque", table::with_unit(served.most_torque_n_m, "N·m")),
         ("tissue moved at most", format!("{:.1} mm", 1e3 * deepest_m)),
         ("from a copy of the tissue", format!("{} ticks", served.predicted_ticks)),
     ];

@@ -2,7 +2,7 @@
 
 use crate::force_law::{Law, Row};
 
-/// Limits of a haptic device, as its client declares them. All values are positive.
+/// Limits of a haptic device, as its client declares them. All values are positive; a torque of 0 means none.
 ///
 /// The force on a Touch is at most 3.3 N. Its own loop renders 400 N/m stably, which a tissue of 1000 N/m exceeds:
 ///
@@ -29,6 +29,8 @@ pub struct Device {
     pub damping_n_s_per_m: f64,
     /// Radius of its workspace, a sphere, m.
     pub workspace_m: f64,
+    /// Largest torque that it can exert for a short time, N·m; 0 if it renders none.
+    pub torque_n_m: f64,
 }
 
 /// Largest force on a person with any device, N; a stronger device is limited to it ([`Device::most_n`]).
@@ -49,7 +51,11 @@ const fn device(
     damping_n_s_per_m: f64,
     workspace_m: f64,
 ) -> Device {
-    Device { name, force_n, continuous_n, stiffness_n_per_m, damping_n_s_per_m, workspace_m }
+    Device { name, force_n, continuous_n, stiffness_n_per_m, damping_n_s_per_m, workspace_m, torque_n_m: 0.0 }
+}
+
+const fn with_torque(device: Device, torque_n_m: f64) -> Device {
+    Device { torque_n_m, ..device }
 }
 
 /// Known devices with the data of their makers. Where a maker gives no continuous force, it is the largest force. The
@@ -61,8 +67,8 @@ pub const DEVICES: [Device; 9] = [
     device("falcon", 8.0, 8.0, 3000.0, 20.0, 0.04),
     device("omega3", 12.0, 12.0, 5000.0, 30.0, 0.075),
     device("delta3", 20.0, 20.0, 5000.0, 30.0, 0.15),
-    device("sigma7", 12.0, 12.0, 4000.0, 30.0, 0.075),
-    device("lambda7", 12.0, 12.0, 8000.0, 30.0, 0.1125),
+    with_torque(device("sigma7", 12.0, 12.0, 4000.0, 30.0, 0.075), 0.4),
+    with_torque(device("lambda7", 12.0, 12.0, 8000.0, 30.0, 0.1125), 0.2),
     device("inverse3", 10.0, 10.0, 1000.0, 6.0, 0.15),
 ];
 
@@ -79,6 +85,16 @@ impl Device {
     /// Returns the largest force requested from it, N: its own limit, but at most [`SAFE_FORCE_N`].
     pub fn most_n(&self) -> f64 {
         self.force_n.min(SAFE_FORCE_N)
+    }
+
+    /// Returns the lever at which its largest force exerts its largest torque, m; 0 if it renders no torque.
+    pub fn lever_m(&self) -> f64 {
+        self.torque_n_m / self.force_n
+    }
+
+    /// Returns the largest torque requested from it, N·m: that of the largest force requested ([`Device::most_n`]) at its lever.
+    pub fn most_n_m(&self) -> f64 {
+        self.lever_m() * self.most_n()
     }
 
     /// Returns a text for each limit of stable rendering that a tissue with `law` exceeds: stiffness, then damping,

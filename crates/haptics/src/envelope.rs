@@ -23,10 +23,17 @@
 //! receives f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly accelerates within a few hundredths of a
 //! second, so this term hardly affects it. To allow a first force before any energy has entered, the energy tank
 //! begins with `CREDIT_J`, and a force of `FIRST_N` against a hand that presses on is always allowed.
+//!
+//! **Torque.** A device of six axes has all of this for the wrench (F, τ/ℓ) and the velocity (v, ω·ℓ), whose product is the power of
+//! force and torque together: ℓ is the device's largest torque divided by its largest force ([`Device::lever_m`]). So a torque
+//! changes by at most ℓ·[`SLEW_N_PER_S`], both have one energy tank, and they fade and ramp in together. The limits of 3 apply to
+//! force and torque each.
 
 use glam::DVec3;
 
 use crate::device::{CONTINUOUS_S, Device};
+use crate::instrument_pose::Wrench;
+use crate::spatial_vector::SpatialVector;
 
 /// Age of the newest model up to which the force is unchanged, s.
 pub const FRESH_S: f64 = 0.05;
@@ -130,6 +137,17 @@ pub struct Wanted {
     pub age_s: Option<f64>,
 }
 
+/// Input of one tick of the envelope about the turning of a device with six axes, in the frame of [`Wanted`].
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct WantedTurn {
+    /// Wanted torque on the device about the place of its tool, before any limit, N·m.
+    pub torque_n_m: DVec3,
+    /// Angular velocity of the device's tool, rad/s.
+    pub angular_rad_per_s: DVec3,
+    /// How far it has turned since the last tick: along the axis of the turn, by its angle, rad.
+    pub turned_rad: DVec3,
+}
+
 /// Safety envelope of one device: it limits each wanted force as at the top of this module, and counts the limits. One
 /// lasts as long as its device is used, over all connections: it holds the last force, the energy and the counts.
 ///
@@ -171,13 +189,13 @@ pub struct Envelope {
     state: RenderingState,
     /// When the ramp began; `None` while it waits for a small force.
     engaged_s: Option<f64>,
-    /// The force rendered now, N.
-    force_n: DVec3,
+    /// The wrench rendered now, N.
+    rendered_n: SpatialVector,
     before: Option<(f64, DVec3)>,
     /// The velocity filtered with the time constant [`ACCELERATION_S`], m/s, and the acceleration that follows from
     /// it.
-    slow_m_per_s: DVec3,
-    acceleration_m_per_s2: DVec3,
+    slow_m_per_s: SpatialVector,
+    acceleration_m_per_s2: SpatialVector,
     /// Energy in the tank, J.
     tank_j: f64,
     /// Total energy that the hand has given to the port, J.
@@ -198,10 +216,10 @@ impl Envelope {
             middle_m,
             state: RenderingState::Disabled,
             engaged_s: None,
-            force_n: DVec3::ZERO,
+            rendered_n: SpatialVector::ZERO,
             before: None,
-            slow_m_per_s: DVec3::ZERO,
-            acceleration_m_per_s2: DVec3::ZERO,
+            slow_m_per_s: SpatialVector::ZERO,
+            acceleration_m_per_s2: SpatialVector::ZERO,
             tank_j: CREDIT_J,
             energy_j: 0.0,
             over_s: 0.0,
@@ -288,20 +306,50 @@ impl Envelope {
     /// A value that is not finite, or a place outside the workspace, changes the state to FAULT; a model or a gap
     /// between two ticks older than [`PAUSE_S`] changes it to PAUSED. The force then falls to zero within the slew.
     pub fn render(&mut self, wanted: &Wanted) -> DVec3 {
+        self.render_wrench(wanted, &WantedTurn::default()).force_n
+    }
+
+    /// Advances the envelope by one tick, as [`Envelope::render`] does, for a device that also turns. Returns force and torque to
+    /// render until the next tick; no torque if the device renders none.
+    pub fn render_wrench(&mut self, wanted: &Wanted, turn: &WantedTurn) -> Wrench {
+        let lever_m = self.device.lever_m();
+        let has_torque = lever_m > 0.0;
+        let if_any = |value: DVec3| if has_torque { value } else { DVec3::ZERO };
+        let rendered_n = self.render_vector(
+            wanted,
+            SpatialVector { linear: wanted.force_n, angular: if_any(turn.torque_n_m / lever_m) },
+            SpatialVector { linear: wanted.velocity_m_per_s, angular: if_any(turn.angular_rad_per_s * lever_m) },
+            if_any(turn.turned_rad * lever_m),
+        );
+        Wrench { force_n: rendered_n.linear, torque_n_m: if_any(rendered_n.angular * lever_m) }
+    }
+
+    /// Advances the envelope with a wanted wrench, N, a velocity, m/s, and how far the device has turned since the last tick, m.
+    fn render_vector(
+        &mut self,
+        wanted: &Wanted,
+        wanted_n: SpatialVector,
+        velocity_m_per_s: SpatialVector,
+        turned_m: DVec3,
+    ) -> SpatialVector {
         self.ticks += 1;
-        let known = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
+        let known = wanted.place_m.is_finite()
+            && velocity_m_per_s.is_finite()
+            && turned_m.is_finite()
+            && wanted.now_s.is_finite();
         if !known || wanted.age_s.is_some_and(|age_s| !age_s.is_finite()) {
             // The place of the device or the age of its model is unknown, so there is no work to account for. The force
             // falls to zero.
             self.acted(LimitCause::NotFinite);
             self.fail();
             let step_n = SLEW_N_PER_S * NOMINAL_S;
-            self.force_n -= self.force_n.clamp_length_max(step_n);
-            return self.force_n;
+            self.rendered_n -= self.rendered_n.clamp_length_max(step_n);
+            return self.rendered_n;
         }
         let elapsed_s = match self.before.replace((wanted.now_s, wanted.place_m)) {
             Some((then_s, place_m)) => {
-                let given_j = -self.force_n.dot(wanted.place_m - place_m);
+                let moved_m = SpatialVector { linear: wanted.place_m - place_m, angular: turned_m };
+                let given_j = -self.rendered_n.dot(moved_m);
                 self.energy_j += given_j;
                 self.tank_j = (self.tank_j + given_j).min(TANK_J);
                 if wanted.now_s - then_s > PAUSE_S && self.state == RenderingState::Enabled {
@@ -313,13 +361,13 @@ impl Envelope {
             }
             None => NOMINAL_S,
         };
-        self.slow_m_per_s += (wanted.velocity_m_per_s - self.slow_m_per_s) * (elapsed_s / (elapsed_s + ACCELERATION_S));
-        self.acceleration_m_per_s2 = (wanted.velocity_m_per_s - self.slow_m_per_s) / ACCELERATION_S;
-        let mut force_n = wanted.force_n;
+        self.slow_m_per_s += (velocity_m_per_s - self.slow_m_per_s) * (elapsed_s / (elapsed_s + ACCELERATION_S));
+        self.acceleration_m_per_s2 = (velocity_m_per_s - self.slow_m_per_s) / ACCELERATION_S;
+        let mut force_n = wanted_n;
         if !force_n.is_finite() {
             self.acted(LimitCause::NotFinite);
             self.fail();
-            force_n = DVec3::ZERO;
+            force_n = SpatialVector::ZERO;
         }
         if (wanted.place_m - self.middle_m).length() > self.device.workspace_m {
             self.acted(LimitCause::Workspace);
@@ -328,14 +376,14 @@ impl Envelope {
         force_n = self.fade(wanted, elapsed_s, force_n);
         force_n = self.engage(wanted, force_n);
         force_n = self.clamp(elapsed_s, force_n);
-        force_n = self.keep_passive(wanted.velocity_m_per_s, force_n);
-        force_n = self.slew(elapsed_s, wanted.velocity_m_per_s, force_n);
-        self.force_n = force_n;
+        force_n = self.keep_passive(velocity_m_per_s, force_n);
+        force_n = self.slew(elapsed_s, velocity_m_per_s, force_n);
+        self.rendered_n = force_n;
         force_n
     }
 
     /// Returns the force reduced by the model's age.
-    fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
+    fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: SpatialVector) -> SpatialVector {
         // Without a model there is no force, and so nothing is stale.
         let age_s = wanted.age_s.unwrap_or(0.0);
         if age_s > PAUSE_S && self.state == RenderingState::Enabled {
@@ -350,10 +398,10 @@ impl Envelope {
         if self.share < 1.0 {
             self.acted(LimitCause::Stale);
         }
-        self.share * force_n
+        force_n * self.share
     }
 
-    fn engage(&mut self, wanted: &Wanted, force_n: DVec3) -> DVec3 {
+    fn engage(&mut self, wanted: &Wanted, force_n: SpatialVector) -> SpatialVector {
         match self.state {
             RenderingState::Enabled => {}
             // While no model arrives, `fade` reduces the force. Here the rest of it is released.
@@ -361,7 +409,7 @@ impl Envelope {
                 self.engaged_s = None;
                 self.acted(LimitCause::Engage);
                 let decay = (-NOMINAL_S / DECAY_S).exp();
-                return self.force_n.clamp_length_max(force_n.length()) * decay;
+                return self.rendered_n.clamp_length_max(force_n.length()) * decay;
             }
         }
         // A zero force before the first model does not mean that the tip is outside the tissue.
@@ -372,11 +420,11 @@ impl Envelope {
         if share < 1.0 {
             self.acted(LimitCause::Engage);
         }
-        share * force_n
+        force_n * share
     }
 
-    fn clamp(&mut self, elapsed_s: f64, force_n: DVec3) -> DVec3 {
-        let wanted_n = force_n.length();
+    fn clamp(&mut self, elapsed_s: f64, force_n: SpatialVector) -> SpatialVector {
+        let wanted_n = force_n.linear.length().max(force_n.angular.length());
         let mut most_n = self.device.most_n();
         if wanted_n > most_n {
             self.acted(LimitCause::Force);
@@ -388,10 +436,13 @@ impl Envelope {
             self.acted(LimitCause::Continuous);
             most_n = self.device.continuous_n;
         }
-        force_n.clamp_length_max(most_n)
+        SpatialVector {
+            linear: force_n.linear.clamp_length_max(most_n),
+            angular: force_n.angular.clamp_length_max(most_n),
+        }
     }
 
-    fn keep_passive(&mut self, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+    fn keep_passive(&mut self, velocity_m_per_s: SpatialVector, force_n: SpatialVector) -> SpatialVector {
         let (length_n, most_n) = (force_n.length(), self.bearable_n(velocity_m_per_s, force_n));
         if length_n <= most_n {
             return force_n;
@@ -403,7 +454,7 @@ impl Envelope {
     /// Returns the largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero,
     /// N: √(2·S·E/v), from ∫ (f − S·t)·v dt = f²·v/2S ≤ E. Here v is 1.5 times the speed along the force, at least
     /// 0.08 m/s, plus a·f/4S.
-    fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
+    fn bearable_n(&self, velocity_m_per_s: SpatialVector, force_n: SpatialVector) -> f64 {
         let along = force_n.normalize_or_zero();
         let along_m_per_s = velocity_m_per_s.dot(along);
         let faster_m_per_s2 = self.acceleration_m_per_s2.dot(along).max(0.0);
@@ -415,19 +466,19 @@ impl Envelope {
 
     /// Returns the last force changed towards the wanted one, as fast as slew allows. A turning force passes through
     /// directions between the two. If the tank cannot cover such a force, the force falls straight to zero.
-    fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+    fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: SpatialVector, force_n: SpatialVector) -> SpatialVector {
         let step_n = SLEW_N_PER_S * elapsed_s;
-        let change_n = force_n - self.force_n;
+        let change_n = force_n - self.rendered_n;
         if change_n.length() <= step_n {
             return force_n;
         }
         self.acted(LimitCause::Slew);
-        let next_n = self.force_n + change_n.clamp_length_max(step_n);
+        let next_n = self.rendered_n + change_n.clamp_length_max(step_n);
         if next_n.length() <= self.bearable_n(velocity_m_per_s, next_n) {
             return next_n;
         }
         self.acted(LimitCause::Passivity);
-        self.force_n - self.force_n.clamp_length_max(step_n)
+        self.rendered_n - self.rendered_n.clamp_length_max(step_n)
     }
 }
 

@@ -11,7 +11,7 @@ use glam::{DQuat, DVec3};
 
 use crate::instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
 use crate::port::{Port, PortLoad};
-use crate::tip::Tip;
+use crate::tip::{Tip, TipShape};
 
 /// Largest number of tips of an instrument.
 pub const MAX_TIPS: usize = 64;
@@ -62,6 +62,31 @@ pub struct Instrument {
 }
 
 impl Instrument {
+    /// Returns the instrument that is a single tip, at the place of its pose.
+    pub fn of_tip(tip: Tip) -> Self {
+        let tip = InstrumentTip { offset_m: DVec3::ZERO, tip, part: InstrumentPart::Body };
+        Instrument { tips: vec![tip], ..Instrument::default() }
+    }
+
+    /// Adds jaws that end at the origin, and a shaft behind them, each with its length, m, and its tip. Closed jaws of spheres touch
+    /// each other; discs lie on the tissue, so that those of both jaws lie on the instrument's axis.
+    pub fn add_parts(&mut self, jaws: Option<(f64, Tip)>, shaft: Option<(f64, Tip)>) {
+        let mut from_m = DVec3::ZERO;
+        if let Some((length_m, tip)) = jaws {
+            self.hinge_m = -length_m * DVec3::X;
+            from_m = self.hinge_m;
+            // At the hinge the tips of both jaws would lie within each other.
+            let begin_m = from_m + (2.0 * tip.radius_m).min(length_m) * DVec3::X;
+            for (part, side) in [(InstrumentPart::UpperJaw, 1.0), (InstrumentPart::LowerJaw, -1.0)] {
+                let beside_m = if tip.shape == TipShape::Sphere { side * tip.radius_m * DVec3::Y } else { DVec3::ZERO };
+                self.add_row(begin_m + beside_m, beside_m, tip, part);
+            }
+        }
+        if let Some((length_m, tip)) = shaft {
+            self.add_row(from_m, from_m - length_m * DVec3::X, tip, InstrumentPart::Body);
+        }
+    }
+
     /// Adds a row of equal tips, from `from_m` to `to_m` (m, in the instrument's frame), at most a radius apart: a capsule.
     pub fn add_row(&mut self, from_m: DVec3, to_m: DVec3, tip: Tip, part: InstrumentPart) {
         // Saturating cast: a length without end gives more tips than an instrument may have.

@@ -1,5 +1,7 @@
 //! Where an instrument is, how it moves, and what acts on it.
 
+use std::ops::{Add, Mul, Sub};
+
 use glam::{DQuat, DVec3};
 
 /// Largest angle between jaws, rad.
@@ -17,6 +19,25 @@ pub struct InstrumentPose {
 }
 
 impl InstrumentPose {
+    /// Returns the pose at a place, not turned, with closed jaws.
+    pub const fn at(place_m: DVec3) -> Self {
+        InstrumentPose { place_m, orientation: DQuat::IDENTITY, jaw_rad: 0.0 }
+    }
+
+    /// Returns whether all its numbers are finite.
+    pub fn is_finite(&self) -> bool {
+        self.place_m.is_finite() && self.orientation.is_finite() && self.jaw_rad.is_finite()
+    }
+
+    /// Returns the shortest turn from this orientation to that of another pose: along its axis, by its angle, rad.
+    pub fn turn_to(&self, other: &Self) -> DVec3 {
+        let turn = other.orientation * self.orientation.conjugate();
+        let half = turn.xyz() * if turn.w < 0.0 { -1.0 } else { 1.0 };
+        let sine = half.length();
+        // For a small angle, twice its sine.
+        if sine < 1e-9 { 2.0 * half } else { half * (2.0 * libm::atan2(sine, turn.w.abs()) / sine) }
+    }
+
     /// Returns the pose at a `part`, 0 to 1, of the way to another: the place on a straight line, the orientation by the shorter turn
     /// at constant angular velocity.
     #[must_use]
@@ -52,7 +73,7 @@ impl InstrumentVelocity {
     }
 }
 
-/// A force and a torque on an instrument, both of the tissue.
+/// A force and a torque on an instrument.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Wrench {
     /// The force, N.
@@ -62,10 +83,53 @@ pub struct Wrench {
 }
 
 impl Wrench {
+    /// Returns the wrench of a force that acts at the stated point, N.
+    pub fn of_force(force_n: DVec3) -> Self {
+        Wrench { force_n, torque_n_m: DVec3::ZERO }
+    }
+
     /// Returns the same wrench with its torque about another point, which lies `by_m` (m) from the former one.
     #[must_use]
     pub fn about(&self, by_m: DVec3) -> Self {
         Wrench { torque_n_m: self.torque_n_m - by_m.cross(self.force_n), ..*self }
+    }
+
+    /// Returns the wrench at a `part`, 0 to 1, of the way to another one about the same point.
+    #[must_use]
+    pub fn lerp(&self, other: Self, part: f64) -> Self {
+        Wrench {
+            force_n: self.force_n.lerp(other.force_n, part),
+            torque_n_m: self.torque_n_m.lerp(other.torque_n_m, part),
+        }
+    }
+
+    /// Returns whether force and torque are finite.
+    pub fn is_finite(&self) -> bool {
+        self.force_n.is_finite() && self.torque_n_m.is_finite()
+    }
+}
+
+impl Add for Wrench {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Wrench { force_n: self.force_n + other.force_n, torque_n_m: self.torque_n_m + other.torque_n_m }
+    }
+}
+
+impl Sub for Wrench {
+    type Output = Self;
+
+    fn sub(self, other: Self) -> Self {
+        Wrench { force_n: self.force_n - other.force_n, torque_n_m: self.torque_n_m - other.torque_n_m }
+    }
+}
+
+impl Mul<f64> for Wrench {
+    type Output = Self;
+
+    fn mul(self, factor: f64) -> Self {
+        Wrench { force_n: self.force_n * factor, torque_n_m: self.torque_n_m * factor }
     }
 }
 
@@ -95,6 +159,18 @@ fn turned_towards(from: DQuat, to: DQuat, part: f64) -> DQuat {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_turn_between_two_poses_is_the_angular_velocity_times_the_time() {
+        let pose = InstrumentPose { orientation: DQuat::from_rotation_y(0.7), ..InstrumentPose::at(DVec3::ZERO) };
+        for turn_rad in [DVec3::ZERO, 1e-12 * DVec3::X, DVec3::new(0.3, -0.5, 0.1), 3.1 * DVec3::Y] {
+            let velocity = InstrumentVelocity { angular_rad_per_s: turn_rad, ..InstrumentVelocity::default() };
+            let after = velocity.after(&pose, 1.0);
+            assert!(pose.turn_to(&after).distance(turn_rad) < 1e-12, "{turn_rad}");
+            let opposite = InstrumentPose { orientation: -after.orientation, ..after };
+            assert!(pose.turn_to(&opposite).distance(turn_rad) < 1e-12, "{turn_rad}");
+        }
+    }
 
     #[test]
     fn half_of_the_way_turns_by_half_of_the_angle() {

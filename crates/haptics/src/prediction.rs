@@ -30,6 +30,7 @@ use std::collections::VecDeque;
 use glam::DVec3;
 
 use crate::dead_reckoning::MotionState;
+use crate::instrument_pose::{InstrumentPose, Wrench};
 use crate::local_model::{ContactState, is_after};
 use crate::tip::Tip;
 
@@ -49,8 +50,9 @@ const GAP_S: f64 = 0.02;
 /// Force and contact of the client's tool in a copy of the tissue at one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Predicted {
-    /// Force of the copy on the tool, N, in the tissue's frame. One that is not finite counts as no answer.
-    pub force_n: DVec3,
+    /// Force of the copy on the tool, N, and its torque about the tool's place, N·m, 0 for a single tip; in the tissue's frame. One
+    /// that is not finite counts as no answer.
+    pub wrench: Wrench,
     /// State of contact between the tool and the copy.
     pub contact_state: ContactState,
     /// Work that the client's tool has done on the copy since it was made, J: negative if it got more than it gave, because other
@@ -82,23 +84,32 @@ pub fn midway_s(model_time_s: f64, now_s: f64) -> f64 {
 /// Largest number of other tools that a client follows.
 pub const MAX_OTHERS: usize = 32;
 
+/// Replaces the `known` other tools by `others`. Leaves out those whose motion is not finite, and beyond [`MAX_OTHERS`] the last.
+pub(crate) fn replace_others(known: &mut Vec<OtherTool>, others: &[OtherTool]) {
+    known.clear();
+    let is_finite = |other: &&OtherTool| {
+        let MotionState { time_s, place_m, velocity_m_per_s } = other.motion;
+        time_s.is_finite() && place_m.is_finite() && velocity_m_per_s.is_finite()
+    };
+    known.extend(others.iter().filter(is_finite).take(MAX_OTHERS));
+}
+
 /// A copy of the tissue on the client's side that contains the client's tool and the other tools that it knows.
 /// [`crate::Renderer::tick`] calls it a thousand times a second, so it should neither block nor allocate.
 pub trait Predictor: Send {
-    /// Moves the tool to `place_m` (m, in the tissue's frame, finite) at `now_s` by the client's clock, s, which never
-    /// goes back, and the `others`, at most [`MAX_OTHERS`], to where they are then; those that are missing have let go.
-    /// Returns the force and contact of the tool; `None` if the copy has no answer, now or from now on: the local model is
-    /// then rendered.
-    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted>;
+    /// Moves the tool, a single tip or an instrument, to a `pose` (in the tissue's frame, finite) at `now_s` by the client's clock,
+    /// s, which never goes back, and the `others`, at most [`MAX_OTHERS`], to where they are then; those that are missing have
+    /// let go. Returns the wrench and contact of the tool; `None` if the copy has no answer, now or from now on.
+    fn feel(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted>;
 }
 
 /// Forces computed in a tick, before the bias and the envelope.
 #[derive(Debug, Clone, Copy)]
 struct Forecast {
     time_s: f64,
-    place_m: DVec3,
-    copy_n: DVec3,
-    predicted_n: DVec3,
+    pose: InstrumentPose,
+    copied: Wrench,
+    predicted: Wrench,
     modelled_n: DVec3,
 }
 
@@ -108,9 +119,9 @@ impl Forecast {
         let part = ((time_s - self.time_s) / (next.time_s - self.time_s)).clamp(0.0, 1.0);
         Forecast {
             time_s,
-            place_m: self.place_m.lerp(next.place_m, part),
-            copy_n: self.copy_n.lerp(next.copy_n, part),
-            predicted_n: self.predicted_n.lerp(next.predicted_n, part),
+            pose: self.pose.towards(&next.pose, part),
+            copied: self.copied.lerp(next.copied, part),
+            predicted: self.predicted.lerp(next.predicted, part),
             modelled_n: self.modelled_n.lerp(next.modelled_n, part),
         }
     }
@@ -124,9 +135,9 @@ pub struct Prediction {
     predictor: Box<dyn Predictor>,
     now: Option<Predicted>,
     past: VecDeque<Forecast>,
-    /// The error e, which is the force of the newest sample minus the copy's force at that time, and the size of the
-    /// copy's force, N; `None` before the first sample.
-    error_n: Option<(DVec3, f64)>,
+    /// The error e, which is the wrench of the newest sample minus the copy's at that time, and the size of the copy's
+    /// force, N; `None` before the first sample.
+    error: Option<(Wrench, f64)>,
     /// Time of the last sample that was compared, s.
     compared_s: f64,
     /// Sums of the squared errors of the copy and of the local models, and of the squared force, N²; old values count
@@ -148,7 +159,7 @@ impl Prediction {
             now: None,
             // A tick must not allocate.
             past: VecDeque::with_capacity(KEPT),
-            error_n: None,
+            error: None,
             compared_s: f64::NEG_INFINITY,
             squared: [0.0; 3],
             is_worse: false,
@@ -159,9 +170,9 @@ impl Prediction {
 
     /// Moves the tools in the copy. Returns by how much the energy that others have given to the client's tool has changed since
     /// the last answer, J.
-    pub(crate) fn move_to(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> f64 {
-        let is_sound = |felt: &Predicted| felt.force_n.is_finite() && felt.own_work_j.is_finite();
-        self.now = self.predictor.feel(now_s, place_m, others).filter(is_sound);
+    pub(crate) fn move_to(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> f64 {
+        let is_sound = |felt: &Predicted| felt.wrench.is_finite() && felt.own_work_j.is_finite();
+        self.now = self.predictor.feel(now_s, pose, others).filter(is_sound);
         self.others_move = others.iter().any(|other| other.motion.velocity_m_per_s != DVec3::ZERO);
         let Some(now) = self.now else { return 0.0 };
         let supplied_j = (-now.own_work_j).max(0.0);
@@ -169,18 +180,18 @@ impl Prediction {
     }
 
     /// Stores the forecast for this tick.
-    pub(crate) fn keep(&mut self, time_s: f64, place_m: DVec3, modelled_n: DVec3) {
+    pub(crate) fn keep(&mut self, time_s: f64, pose: &InstrumentPose, modelled_n: DVec3) {
         let Some(felt) = self.now else { return };
         if self.past.len() == KEPT {
             self.past.pop_front();
         }
-        let predicted_n = self.sum_n(felt);
-        self.past.push_back(Forecast { time_s, place_m, copy_n: felt.force_n, predicted_n, modelled_n });
+        let predicted = self.sum(felt);
+        self.past.push_back(Forecast { time_s, pose: *pose, copied: felt.wrench, predicted, modelled_n });
     }
 
-    /// Compares the forecast for the time of a sample with the sample; `truth_n` returns the sample's force on a tool
-    /// at a place.
-    pub(crate) fn compare(&mut self, time_s: f64, truth_n: impl FnOnce(DVec3) -> DVec3) {
+    /// Compares the forecast for the time of a sample with the sample; `truth` returns the sample's wrench on a tool at a pose,
+    /// about its place, or `None` if the sample says nothing about that pose.
+    pub(crate) fn compare(&mut self, time_s: f64, truth: impl FnOnce(&InstrumentPose) -> Option<Wrench>) {
         let after = self.past.partition_point(|past| !is_after(past.time_s, time_s));
         // The sample is older than the first forecast.
         let Some(before) = after.checked_sub(1).and_then(|at| self.past.get(at)) else { return };
@@ -190,17 +201,18 @@ impl Prediction {
         }
         // There may be no later forecast.
         let then = next.map_or(*before, |next| before.towards(next, time_s));
-        let truth_n = truth_n(then.place_m);
-        let (error_n, size_n) = (truth_n - then.copy_n, then.copy_n.length());
+        let Some(truth) = truth(&then.pose) else { return };
+        let (error, size_n) = (truth - then.copied, then.copied.force_n.length());
         let kept = if self.others_move { ((self.compared_s - time_s).min(0.0) / MEMORY_S).exp() } else { 0.0 };
-        let (before_n, before_size_n) = self.error_n.unwrap_or((error_n, size_n));
-        self.error_n = Some((error_n.lerp(before_n, kept), size_n + kept * (before_size_n - size_n)));
+        let (before, before_size_n) = self.error.unwrap_or((error, size_n));
+        self.error = Some((error.lerp(before, kept), size_n + kept * (before_size_n - size_n)));
         // A server that receives nothing sends samples of the same time again.
         if time_s <= self.compared_s {
             return;
         }
         let memory = ((self.compared_s - time_s) / MEMORY_S).exp();
-        let values_n = [then.predicted_n - truth_n, then.modelled_n - truth_n, truth_n];
+        let truth_n = truth.force_n;
+        let values_n = [then.predicted.force_n - truth_n, then.modelled_n - truth_n, truth_n];
         for (squared, value_n) in self.squared.iter_mut().zip(values_n) {
             *squared = memory * *squared + value_n.length_squared();
         }
@@ -214,31 +226,42 @@ impl Prediction {
     /// which nothing may pull: `None` if the tool holds the tissue, `normal` while it does not touch the copy.
     /// Returns `None` as a whole while the local model is to be rendered.
     pub(crate) fn wanted_n(&self, normal: DVec3) -> Option<(DVec3, Option<DVec3>)> {
-        let felt = self.now.filter(|_| self.error_n.is_some() && !self.is_worse)?;
+        let felt = self.now.filter(|_| self.error.is_some() && !self.is_worse)?;
         let outward = match felt.contact_state {
             ContactState::Holding => None,
-            _ => Some(felt.force_n.try_normalize().unwrap_or(normal)),
+            _ => Some(felt.wrench.force_n.try_normalize().unwrap_or(normal)),
         };
-        Some((self.sum_n(felt), outward))
+        Some((self.sum(felt).force_n, outward))
     }
 
-    /// Returns c + e, N: 0 if the tip does not touch the copy.
-    fn sum_n(&self, felt: Predicted) -> DVec3 {
-        let (error_n, size_n) = self.error_n.unwrap_or_default();
+    /// Returns the present wrench from the copy and the newest sample; `None` before the first sample, and while the copy has no
+    /// answer.
+    pub(crate) fn wrench(&self) -> Option<Wrench> {
+        self.now.filter(|_| self.error.is_some()).map(|felt| self.sum(felt))
+    }
+
+    /// Returns whether the copy had an answer in the last tick.
+    pub(crate) fn has_answer(&self) -> bool {
+        self.now.is_some()
+    }
+
+    /// Returns c + e: 0 if the tool does not touch the copy.
+    fn sum(&self, felt: Predicted) -> Wrench {
+        let (error, size_n) = self.error.unwrap_or_default();
         match felt.contact_state {
-            ContactState::Free => DVec3::ZERO,
-            ContactState::Holding => felt.force_n + error_n,
-            _ if size_n > 0.0 => felt.force_n + error_n * (felt.force_n.length() / size_n).min(1.0),
-            _ => felt.force_n,
+            ContactState::Free => Wrench::default(),
+            ContactState::Holding => felt.wrench + error,
+            _ if size_n > 0.0 => felt.wrench + error * (felt.wrench.force_n.length() / size_n).min(1.0),
+            _ => felt.wrench,
         }
     }
 }
 
 impl std::fmt::Debug for Prediction {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Prediction { now, error_n, squared, is_worse, .. } = self;
+        let Prediction { now, error, squared, is_worse, .. } = self;
         let mut fields = f.debug_struct("Prediction");
-        fields.field("now", now).field("error_n", error_n).field("squared", squared).field("is_worse", is_worse);
+        fields.field("now", now).field("error", error).field("squared", squared).field("is_worse", is_worse);
         fields.finish_non_exhaustive()
     }
 }

@@ -24,11 +24,11 @@
 
 use glam::DVec3;
 
-use crate::dead_reckoning::MotionState;
 use crate::envelope::{Envelope, RenderingState, Wanted};
 use crate::force_law::Law;
+use crate::instrument_pose::{InstrumentPose, Wrench};
 use crate::local_model::{ContactState, LocalModel, Touching, Track};
-use crate::prediction::{MAX_OTHERS, OtherTool, Prediction};
+use crate::prediction::{MAX_OTHERS, OtherTool, Prediction, replace_others};
 
 /// Time constant with which the bias (the difference of the force to that of the model before) decays, s.
 pub const BIAS_S: f64 = 0.02;
@@ -149,12 +149,7 @@ impl Renderer {
     /// Replaces what is known of the other tools on the tissue, for the copy of it; at first there are none. Beyond
     /// [`MAX_OTHERS`] the last are left out. Those whose motion is not finite are left out too. Does not allocate.
     pub fn follow_others(&mut self, others: &[OtherTool]) {
-        self.others.clear();
-        let is_finite = |other: &&OtherTool| {
-            let MotionState { time_s, place_m, velocity_m_per_s } = other.motion;
-            time_s.is_finite() && place_m.is_finite() && velocity_m_per_s.is_finite()
-        };
-        self.others.extend(others.iter().filter(is_finite).take(MAX_OTHERS));
+        replace_others(&mut self.others, others);
     }
 
     /// Returns the number of ticks that were rendered from a copy of the tissue, since the renderer was created.
@@ -258,10 +253,10 @@ impl Renderer {
         }
         self.newest = Some((model, touching));
         if let Some(prediction) = &mut self.prediction {
-            prediction.compare(model.client_time_s, |place_m| {
+            prediction.compare(model.client_time_s, |pose| {
                 let mut then = Touching::at_sample(&model, law);
-                then.move_to(&model, law, place_m);
-                then.force_n(&model, law, model.velocity_m_per_s)
+                then.move_to(&model, law, pose.place_m);
+                Some(Wrench::of_force(then.force_n(&model, law, model.velocity_m_per_s)))
             });
         }
         (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
@@ -331,7 +326,7 @@ impl Renderer {
             }
             let others = &self.others;
             if let Some(prediction) = &mut self.prediction {
-                self.envelope.supply(prediction.move_to(now_s, place_m, others));
+                self.envelope.supply(prediction.move_to(now_s, &InstrumentPose::at(place_m), others));
             }
             if let Some((model, arrived_s)) = self.arrived.take() {
                 self.newest_s = Some(arrived_s);
@@ -348,7 +343,9 @@ impl Renderer {
         self.predicted += u64::from(is_predicted);
         if known && self.prediction.is_some() {
             let modelled_n = self.modelled_n();
-            self.prediction.iter_mut().for_each(|prediction| prediction.keep(now_s, place_m, modelled_n));
+            self.prediction
+                .iter_mut()
+                .for_each(|prediction| prediction.keep(now_s, &InstrumentPose::at(place_m), modelled_n));
         }
         // While forces are rendered, the first model of a new connection counts as late like any other.
         let counts = self.newest.is_some() || self.envelope.is_engaged();
@@ -488,10 +485,11 @@ mod tests {
     struct Copy(f64);
 
     impl crate::Predictor for Copy {
-        fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<crate::Predicted> {
+        fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<crate::Predicted> {
+            let place_m = pose.place_m;
             let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
             Some(crate::Predicted {
-                force_n: -400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z,
+                wrench: Wrench::of_force(-400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z),
                 contact_state,
                 own_work_j: 0.0,
             })

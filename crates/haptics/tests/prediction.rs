@@ -8,7 +8,8 @@ use glam::{DMat3, DVec3};
 use palpate_haptics::envelope::ENGAGE_S;
 use palpate_haptics::renderer::BIAS_S;
 use palpate_haptics::{
-    ContactState, Device, Envelope, Law, LocalModel, OtherTool, Predicted, Prediction, Predictor, Renderer,
+    ContactState, Device, Envelope, InstrumentPose, Law, LocalModel, OtherTool, Predicted, Prediction, Predictor,
+    Renderer, Wrench,
 };
 
 const TICK_S: f64 = 1e-3;
@@ -29,9 +30,11 @@ struct Copy {
 }
 
 impl Predictor for Copy {
-    fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
+    fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
+        let place_m = pose.place_m;
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-        let felt = Predicted { force_n: self.factor * force_n(place_m), contact_state, own_work_j: 0.0 };
+        let felt =
+            Predicted { wrench: Wrench::of_force(self.factor * force_n(place_m)), contact_state, own_work_j: 0.0 };
         (!self.is_off.load(Ordering::Relaxed)).then_some(felt)
     }
 }

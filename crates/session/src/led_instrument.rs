@@ -5,7 +5,6 @@
 
 use std::collections::VecDeque;
 
-use glam::{DQuat, DVec3};
 use palpate_haptics::pose_playback::EXTRAPOLATE_S;
 use palpate_haptics::{Instrument, InstrumentPose, InstrumentVelocity, PortLoad, Wrench};
 
@@ -40,14 +39,14 @@ pub struct LedInstrument {
 pub struct InstrumentSample {
     /// The tool of its first tip.
     pub first_tool: u32,
-    /// The point about which the torque is, m: the place of the instrument's pose.
-    pub about_m: DVec3,
-    /// Force and torque of the tissue on the instrument.
+    /// The time by the client's clock at which it was there, s; 0 if its poses have none.
+    pub client_time_s: f64,
+    /// Where it was then.
+    pub pose: InstrumentPose,
+    /// Force and torque of the tissue on the instrument, about its place.
     pub wrench: Wrench,
     /// Torque with which the tissue opens the jaws, N·m; `None` without jaws.
     pub opening_n_m: Option<f64>,
-    /// The orientation of the instrument.
-    pub orientation: DQuat,
     /// What its port and the hand exert; `None` without a port.
     pub port_load: Option<PortLoad>,
 }
@@ -116,7 +115,13 @@ impl LedInstrument {
 
     fn each(&self, command: &Command, action: impl Fn(usize) -> Action) -> Vec<Command> {
         let tools = (self.first_tool..).take(self.instrument.tips.len()).enumerate();
-        tools.map(|(number, tool)| Command { tool, action: action(number), ..command.clone() }).collect()
+        let each = |(number, tool)| {
+            let action = action(number);
+            // Only poses may be overtaken.
+            let by_datagram = command.by_datagram && matches!(action, Action::Pose { .. });
+            Command { tool, action, by_datagram, ..command.clone() }
+        };
+        tools.map(each).collect()
     }
 
     /// Notes that the commands of [`LedInstrument::lead`] were accepted.
@@ -129,7 +134,9 @@ impl LedInstrument {
         let client_time_s = by_time.then_some(command.client_time_ns as f64 * 1e-9);
         let (pose, velocity) = self.led(&pose, velocity.as_ref());
         let (sequence, velocity) = (command.sequence.unwrap_or_default(), velocity.unwrap_or_default());
-        self.poses.push_back(AcceptedPose { sequence, client_time_s, pose, velocity });
+        // A datagram may have overtaken another.
+        let after = self.poses.partition_point(|before| before.sequence < sequence);
+        self.poses.insert(after, AcceptedPose { sequence, client_time_s, pose, velocity });
     }
 
     /// Returns what the instrument felt by a sample of its tools; `None` before its first pose has acted, and after its release.
@@ -141,8 +148,8 @@ impl LedInstrument {
         let wrench = self.instrument.wrench(&pose, forces_n());
         Some(InstrumentSample {
             first_tool: self.first_tool,
-            about_m: pose.place_m,
-            orientation: pose.orientation,
+            client_time_s: led.place_time_s,
+            pose,
             wrench,
             port_load: self.instrument.port_load(&pose, &wrench),
             opening_n_m: self.instrument.has_jaws().then(|| self.instrument.opening_n_m(&pose, forces_n())),

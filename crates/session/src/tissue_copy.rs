@@ -1,11 +1,11 @@
-//! A copy of a session's tissue for one tool, which a client steps itself without delay
+//! A copy of a session's tissue for one tool or instrument, which a client steps itself without delay
 //! ([`palpate_haptics::prediction`]).
 
 use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_haptics::prediction::MAX_OTHERS;
-use palpate_haptics::{ContactState, OtherTool, Predicted, Predictor, Tip};
+use palpate_haptics::{ContactState, Instrument, InstrumentPose, OtherTool, Predicted, Predictor, Tip, Wrench};
 
 use super::Session;
 use super::command::{Command, Due};
@@ -13,12 +13,9 @@ use super::rules::Rules;
 use palpate_refusal::{Result, legible, number};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::action_check::check_tip;
-use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::script::{Action, is_led};
 use palpate_tissue::shape::RestShape;
 use palpate_tissue::{Model, ToolContact};
-
-/// Number of the client's tool in the copy. Other tools have the following ones.
-const TOOL: u32 = 0;
 
 /// Limit of a client copy's work in a millisecond, in awake points times substeps: this takes up to 1 ms with a tip
 /// on the tissue. Beyond it the copy predicts nothing.
@@ -70,21 +67,24 @@ impl LedTool {
     }
 }
 
-/// A copy of a tissue with a client's tool, which predicts the force on the tool between a server's samples. It begins at
-/// rest. Of the other tools it knows those that are led by poses, as far as the client does.
+/// A copy of a tissue with a client's instrument, which may be a single tip. It predicts the wrench on that between a server's
+/// samples. It begins at rest. Of the other tools it knows those that are led by poses, as far as the client does.
 pub struct TissueCopy {
     session: Session,
     /// What the other tools may do: a server is not believed.
     rules: Rules,
-    tip: Tip,
+    /// The client's instrument. Its tips are the first tools; other tools have the following ones.
+    instrument: Instrument,
+    /// Which of its tips are led.
+    is_led: Vec<bool>,
     /// The other tools on the copy.
     others: [Option<LedTool>; MAX_OTHERS],
-    /// The work of the client's tool.
-    work: ToolWork,
+    /// The work of each tip.
+    work: Vec<ToolWork>,
     due: Vec<Due>,
     /// The client's time minus the copy's, s; `None` before the first tick.
     ahead_s: Option<f64>,
-    place_m: DVec3,
+    pose: InstrumentPose,
     /// Points times substeps that may be computed in a tick.
     most_point_substeps: u64,
 }
@@ -92,15 +92,22 @@ pub struct TissueCopy {
 impl TissueCopy {
     /// Creates a copy at rest, for a tool with this tip, without a limit of its work and without a check of the tip.
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
+        TissueCopy::of_instrument(model, Instrument::of_tip(tip))
+    }
+
+    /// Creates a copy at rest, for an instrument, without a limit of its work and without a check of the tips.
+    pub fn of_instrument(model: &Arc<Model>, instrument: Instrument) -> Self {
+        let tips = instrument.tips.len();
         TissueCopy {
             session: Session::new(model),
             rules: Rules::new(&model.scene, &Limits::default()),
-            tip,
+            instrument,
+            is_led: vec![false; tips],
             others: [None; MAX_OTHERS],
-            work: ToolWork::default(),
-            due: Vec::with_capacity(1 + 2 * MAX_OTHERS),
+            work: vec![ToolWork::default(); tips],
+            due: Vec::with_capacity(tips + 2 * MAX_OTHERS),
             ahead_s: None,
-            place_m: DVec3::ZERO,
+            pose: InstrumentPose::at(DVec3::ZERO),
             most_point_substeps: u64::MAX,
         }
     }
@@ -117,24 +124,26 @@ impl TissueCopy {
     ///
     /// # Errors
     /// Refuses a tip that does not fit the tissue, and a radius above 32 lengths of an edge (`tip.radius_m`).
-    pub fn for_client(model: &Arc<Model>, tip: Tip) -> Result<Self> {
+    pub fn for_client(model: &Arc<Model>, instrument: &Instrument) -> Result<Self> {
         let shape = model.shape();
-        check_tip("tip", shape, &tip)?;
         let most_m = most_radius_m(shape);
         let range = format!("at most {} for a copy of this tissue, {MAX_EDGES} lengths of an edge", legible(most_m));
-        number("tip.radius_m", tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
-        Ok(TissueCopy::new(model, tip).within(TICK_POINT_SUBSTEPS))
+        for tip in &instrument.tips {
+            check_tip("tip", shape, &tip.tip)?;
+            number("tip.radius_m", tip.tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
+        }
+        Ok(TissueCopy::of_instrument(model, instrument.clone()).within(TICK_POINT_SUBSTEPS))
     }
 
-    /// Steps until `now_s`, with the tool on a straight path to `place_m`, and the others on theirs. The number of steps is
+    /// Steps until `now_s`, with the instrument on its way to `pose`, and the others on theirs. The number of steps is
     /// rounded, so that ticks that are a little early or late have one step each. `None` if too many points are awake.
-    fn step_to(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<()> {
+    fn step_to(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> Option<()> {
         let step_s = self.session.model().scene.stepping.rate_hz.recip();
         let time_s = self.session.time_s();
         let behind_s = self.ahead_s.map(|ahead_s| now_s - ahead_s - time_s);
         let behind_s = behind_s.filter(|behind_s| *behind_s <= MAX_BEHIND_S.max(2.0 * step_s)).unwrap_or_else(|| {
             // The tool gets there at once; its largest speed limits how far it moves in a step.
-            (self.ahead_s, self.place_m) = (Some(now_s - step_s - time_s), place_m);
+            (self.ahead_s, self.pose) = (Some(now_s - step_s - time_s), *pose);
             step_s
         });
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -143,16 +152,35 @@ impl TissueCopy {
             if self.is_too_much(step_s) {
                 return None;
             }
-            let on_way_m = self.place_m.lerp(place_m, f64::from(step) / f64::from(steps));
-            self.due.push(led(TOOL, on_way_m, self.tip));
+            let on_way = self.pose.towards(pose, f64::from(step) / f64::from(steps));
+            self.lead(if step == steps { pose } else { &on_way });
             self.lead_others(now_s - f64::from(steps - step) * step_s, others);
             self.session.advance(&mut self.due, |_| {});
-            self.work.add(self.session.tissue().tool_contact(TOOL as usize));
+            let tissue = self.session.tissue();
+            self.work.iter_mut().enumerate().for_each(|(tool, work)| work.add(tissue.tool_contact(tool)));
         }
         if steps > 0 {
-            self.place_m = place_m;
+            self.pose = *pose;
         }
         Some(())
+    }
+
+    /// Leads the tips of the instrument to a pose. As a server does, releases those that are far from the tissue, unless there is
+    /// only one.
+    fn lead(&mut self, pose: &InstrumentPose) {
+        let pose = self.instrument.lead(pose);
+        let shape = self.session.model().shape();
+        let is_single = self.instrument.tips.len() == 1;
+        for (number, is_led_now) in self.is_led.iter_mut().enumerate() {
+            let (tip, place_m) = (self.instrument.tips[number].tip, self.instrument.tip_m(number, &pose));
+            let tool = tool_at(number);
+            let was_led = std::mem::replace(is_led_now, is_single || is_led(shape, place_m, tip.radius_m));
+            if *is_led_now {
+                self.due.push(led(tool, place_m, tip));
+            } else if was_led {
+                self.due.push(Due::in_time(Command::new(tool, None, Action::Release)));
+            }
+        }
     }
 
     /// Leads the other tools to where they are at a time of the client, and releases those that are no longer known. Ignores
@@ -160,17 +188,18 @@ impl TissueCopy {
     fn lead_others(&mut self, time_s: f64, others: &[OtherTool]) {
         let most_m = most_radius_m(self.session.model().shape());
         let known = || others.iter().filter(|other| other.tip.radius_m <= most_m);
+        let tips = self.instrument.tips.len();
         for (slot, led_tool) in self.others.iter_mut().enumerate() {
             if led_tool.is_some_and(|led_tool| !known().any(|other| led_tool.is(other))) {
                 *led_tool = None;
-                self.due.push(Due::in_time(Command::new(tool_at(slot), None, Action::Release)));
+                self.due.push(Due::in_time(Command::new(tool_at(tips + slot), None, Action::Release)));
             }
         }
         for other in known() {
             let has = |led_tool: &Option<LedTool>| led_tool.is_some_and(|led_tool| led_tool.tool == other.tool);
             let slot = self.others.iter().position(has).or_else(|| self.others.iter().position(Option::is_none));
             let Some(slot) = slot else { continue };
-            let due = led(tool_at(slot), other.motion.at(time_s), other.tip);
+            let due = led(tool_at(tips + slot), other.motion.at(time_s), other.tip);
             if self.rules.check_one(&due.command).is_err() {
                 continue;
             }
@@ -187,10 +216,9 @@ impl TissueCopy {
     }
 }
 
-/// Returns the number of another tool in the copy.
 #[allow(clippy::cast_possible_truncation)]
-fn tool_at(slot: usize) -> u32 {
-    TOOL + 1 + slot as u32
+fn tool_at(number: usize) -> u32 {
+    number as u32
 }
 
 /// Returns the largest radius of a tip on a copy, m.
@@ -204,24 +232,31 @@ fn led(tool: u32, place_m: DVec3, tip: Tip) -> Due {
 }
 
 impl Predictor for TissueCopy {
-    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted> {
+    fn feel(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted> {
         if self.session.hold_reason().is_some() {
             return None;
         }
-        self.step_to(now_s, place_m, others)?;
-        let felt = self.session.tissue().tool_contact(TOOL as usize);
-        let own_work_j = self.work.done_j;
-        let (force_n, contact_state) =
-            felt.map_or((DVec3::ZERO, ContactState::Free), |feel| (feel.force_on_tool_n, feel.contact_state));
-        Some(Predicted { force_n, contact_state, own_work_j })
+        self.step_to(now_s, pose, others)?;
+        let tissue = self.session.tissue();
+        let felt = || (0..self.work.len()).filter_map(|tool| Some((tool, tissue.tool_contact(tool)?)));
+        let forces_n = felt().map(|(tool, contact)| (tool, contact.force_on_tool_n));
+        let wrench = match self.work.len() {
+            // A single tip turns with nothing.
+            1 => Wrench::of_force(forces_n.map(|(_, force_n)| force_n).sum()),
+            _ => self.instrument.wrench(&self.instrument.lead(pose), forces_n),
+        };
+        // A tip that holds, sticks or slides says so for all.
+        let touching = felt().map(|(_, contact)| contact.contact_state).find(|state| *state != ContactState::Free);
+        let own_work_j = self.work.iter().map(|work| work.done_j).sum();
+        Some(Predicted { wrench, contact_state: touching.unwrap_or(ContactState::Free), own_work_j })
     }
 }
 
 impl std::fmt::Debug for TissueCopy {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let TissueCopy { ahead_s, place_m, most_point_substeps, .. } = self;
+        let TissueCopy { ahead_s, pose, most_point_substeps, .. } = self;
         let mut fields = f.debug_struct("TissueCopy");
-        fields.field("ahead_s", ahead_s).field("place_m", place_m).field("most_point_substeps", most_point_substeps);
+        fields.field("ahead_s", ahead_s).field("pose", pose).field("most_point_substeps", most_point_substeps);
         fields.finish_non_exhaustive()
     }
 }
@@ -236,6 +271,10 @@ mod tests {
         let time_s = f64::from(tick) * TICK_S;
         let down = (time_s / 0.1).min(1.0);
         DVec3::new(0.05 + 0.02 * (time_s - 0.1).max(0.0), 0.05, 0.002 - 0.005 * down)
+    }
+
+    fn at(place_m: DVec3) -> InstrumentPose {
+        InstrumentPose::at(place_m)
     }
 
     fn model() -> Arc<Model> {
@@ -266,8 +305,8 @@ mod tests {
         let mut copy = TissueCopy::new(&model, Tip::default());
         for (tick, truth_n) in (0..300).zip(truth_n) {
             let early_s = [0.0, -3e-4, 4e-4, 1e-4][tick as usize % 4];
-            let felt = copy.feel(17.0 + f64::from(tick) * TICK_S + early_s, place_m(tick), &[]).unwrap();
-            assert_eq!(felt.force_n, truth_n, "{tick}");
+            let felt = copy.feel(17.0 + f64::from(tick) * TICK_S + early_s, &at(place_m(tick)), &[]).unwrap();
+            assert_eq!(felt.wrench, Wrench::of_force(truth_n), "{tick}");
         }
     }
 
@@ -295,10 +334,10 @@ mod tests {
             session.advance(&mut due, |_| {});
             let truth_n = session.tissue().tool_contact(0).map_or(DVec3::ZERO, |feel| feel.force_on_tool_n);
             let others: Vec<_> = other(tick).into_iter().collect();
-            let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick), &others).unwrap();
-            assert_eq!(felt.force_n, truth_n, "{tick}");
+            let felt = copy.feel(f64::from(tick) * TICK_S, &at(place_m(tick)), &others).unwrap();
+            assert_eq!(felt.wrench, Wrench::of_force(truth_n), "{tick}");
             (least_j, most_j) = (least_j.min(felt.own_work_j), most_j.max(felt.own_work_j));
-            let alone_n = alone.feel(f64::from(tick) * TICK_S, place_m(tick), &[]).unwrap().force_n;
+            let alone_n = alone.feel(f64::from(tick) * TICK_S, &at(place_m(tick)), &[]).unwrap().wrench.force_n;
             apart_n = apart_n.max(alone_n.distance(truth_n));
         }
         // The other tool matters, and this one gives the tissue the work of a press of some millimetres.
@@ -323,7 +362,7 @@ mod tests {
             let place_m = DVec3::new(0.035, 0.0375, 0.001 - 0.003 * depth_m(tick, [100, 300]));
             let beside_m = DVec3::new(0.041, 0.0375, 0.001 - 0.007 * depth_m(tick, [0, 200]));
             let motion = MotionState { time_s, place_m: beside_m, velocity_m_per_s: DVec3::ZERO };
-            let felt = copy.feel(time_s, place_m, &[OtherTool { tool: 1, tip: Tip::default(), motion }]).unwrap();
+            let felt = copy.feel(time_s, &at(place_m), &[OtherTool { tool: 1, tip: Tip::default(), motion }]).unwrap();
             gave_j = gave_j.max(felt.own_work_j);
             gets_j = -felt.own_work_j;
         }
@@ -351,8 +390,8 @@ mod tests {
             sound,
         ];
         for tick in 50..150 {
-            let felt = copy.feel(f64::from(tick) * TICK_S, place_m, &others).unwrap();
-            assert!(felt.force_n.is_finite() && felt.own_work_j.is_finite());
+            let felt = copy.feel(f64::from(tick) * TICK_S, &at(place_m), &others).unwrap();
+            assert!(felt.wrench.is_finite() && felt.own_work_j.is_finite());
         }
         let led_tools: Vec<u32> = copy.others.iter().flatten().map(|led_tool| led_tool.tool).collect();
         assert_eq!(led_tools, [7]);
@@ -364,8 +403,8 @@ mod tests {
         let mut copy = TissueCopy::new(&model, Tip::default());
         let steps = |copy: &TissueCopy| copy.session.step_count();
         for (tick, expected) in [(0, 1), (1, 2), (5, 6), (15, 7), (15, 7), (16, 8), (5000, 9), (5001, 10)] {
-            let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick.min(200)), &[]).unwrap();
-            assert!(felt.force_n.is_finite() && steps(&copy) == expected, "{tick}: {} steps", steps(&copy));
+            let felt = copy.feel(f64::from(tick) * TICK_S, &at(place_m(tick.min(200))), &[]).unwrap();
+            assert!(felt.wrench.is_finite() && steps(&copy) == expected, "{tick}: {} steps", steps(&copy));
         }
     }
 
@@ -381,8 +420,8 @@ mod tests {
             .unwrap();
             let mut copy = TissueCopy::new(&model, Tip::default());
             for tick in 0..2000 {
-                let felt = copy.feel(3.0 + f64::from(tick) * TICK_S, DVec3::new(0.1, 0.1, 0.01), &[]).unwrap();
-                assert!(felt.force_n.is_finite());
+                let felt = copy.feel(3.0 + f64::from(tick) * TICK_S, &at(DVec3::new(0.1, 0.1, 0.01)), &[]).unwrap();
+                assert!(felt.wrench.is_finite());
             }
             let apart_s = (copy.session.time_s() - 2.0).abs();
             assert!(apart_s <= 2.0 / rate_hz + TICK_S, "{rate_hz} Hz: {} s", copy.session.time_s());
@@ -393,7 +432,7 @@ mod tests {
     fn a_copy_with_too_much_to_compute_tells_nothing() {
         let model = model();
         let mut copy = TissueCopy::new(&model, Tip::default()).within(50);
-        let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, place_m(tick), &[])).collect();
+        let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, &at(place_m(tick)), &[])).collect();
         // Nothing is computed at rest.
         assert!(felt[0].is_some() && felt[199].is_none());
     }

@@ -48,11 +48,13 @@ pub(super) fn message(sample: &InstrumentSample) -> pb::InstrumentSample {
     use palpate_proto::geometry::vector;
     pb::InstrumentSample {
         first_tool: sample.first_tool,
-        about_m: vector(sample.about_m),
+        about_m: vector(sample.pose.place_m),
         force_on_tool_n: vector(sample.wrench.force_n),
         torque_on_tool_n_m: vector(sample.wrench.torque_n_m),
         opening_n_m: sample.opening_n_m,
-        orientation: instrument::orientation(sample.orientation),
+        orientation: instrument::orientation(sample.pose.orientation),
+        jaw_rad: sample.pose.jaw_rad,
+        client_time_ns: (sample.client_time_s * 1e9).round().max(0.0) as u64,
         port_load: sample.port_load.map(|PortLoad { force_of_port_n, on_hand }| pb::PortLoad {
             force_of_port_n: vector(force_of_port_n),
             force_on_hand_n: vector(on_hand.force_n),

@@ -56,7 +56,8 @@ fn within_reach(command: Command, handle: &SessionHandle, device: Option<&Device
 
 /// Returns whether a command may also arrive by datagram: a pose that is played back by the client's time.
 fn may_overtake(command: &pb::Command) -> bool {
-    let is_pose = matches!(command.action, Some(pb::command::Action::Pose(_)));
+    use pb::command::Action as Message;
+    let is_pose = matches!(command.action, Some(Message::Pose(_) | Message::Instrument(_)));
     is_pose && command.client_time_ns != 0 && command.at_step.is_none() && command.sequence.is_some()
 }
 
@@ -105,7 +106,8 @@ impl LeaseController {
     /// Returns a refusal that ends the stream if commands arrive far too fast.
     pub(super) fn datagram(&mut self, datagram: Result<pb::PosesDatagram>, events: &Writer<StreamEvent>) -> Result<()> {
         let Ok(message) = datagram else { return Ok(()) };
-        for command in message.tools.iter().flat_map(datagram::commands) {
+        let of_tools = message.tools.iter().flat_map(datagram::commands);
+        for command in of_tools.chain(datagram::instrument_commands(&message)) {
             if may_overtake(&command) && self.is_new(&command) {
                 self.take(&command, true, events)?;
             }
@@ -130,7 +132,13 @@ impl LeaseController {
     }
 
     /// Accepts a command to an instrument: one to each of its tools, or none.
-    fn lead(&mut self, instrument: &mut LedInstrument, message: &pb::Command, now: u64) -> Result<()> {
+    fn lead(
+        &mut self,
+        instrument: &mut LedInstrument,
+        message: &pb::Command,
+        by_datagram: bool,
+        now: u64,
+    ) -> Result<()> {
         use pb::command::Action as Message;
         let first = instrument.first_tool();
         let refuse = |reason, field: &str, text: String| Err(Refusal::new(reason, field, text));
@@ -143,7 +151,7 @@ impl LeaseController {
         };
         (0..instrument.instrument().tips.len()).try_for_each(|_| self.commands.take(now, COMMANDS))?;
         let command = wire::command::with_action(message, Action::Release, now);
-        let command = Command { sequence: Some(sequence), ..command };
+        let command = Command { sequence: Some(sequence), by_datagram, ..command };
         match &message.action {
             Some(Message::Instrument(pose)) => {
                 let (pose, velocity) = instrument::from_pose(pose, instrument.instrument())?;
@@ -172,7 +180,7 @@ impl LeaseController {
         let now = now_ns();
         let instruments = self.instruments.clone();
         let taken = match lock(&instruments).iter_mut().find(|instrument| instrument.has(message.tool)) {
-            Some(instrument) => self.lead(instrument, message, now),
+            Some(instrument) => self.lead(instrument, message, by_datagram, now),
             None => self.command_tool(message, by_datagram, now),
         };
         let handle = &self.handle;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use palpate_haptics::{Predictor, Tip};
+use palpate_haptics::{Instrument, Predictor};
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 use tokio::sync::Semaphore;
@@ -36,7 +36,7 @@ impl Copier {
 pub(super) struct Copying {
     channel: Channel,
     session_id: String,
-    tip: Tip,
+    instrument: Instrument,
     /// `None`: this tissue is not copied.
     copier: Option<Copier>,
     /// At most one task, which is aborted when this is dropped.
@@ -45,10 +45,15 @@ pub(super) struct Copying {
 
 impl Copying {
     /// Creates the copying of a session's tissue, if `copier` copies such tissues.
-    pub(super) fn new(copier: Option<&Copier>, session: &pb::Session, channel: Channel, tip: Tip) -> Self {
+    pub(super) fn new(
+        copier: Option<&Copier>,
+        session: &pb::Session,
+        channel: Channel,
+        instrument: Instrument,
+    ) -> Self {
         let is_grid = session.scene.as_ref().is_some_and(|scene| palpate_proto::scene::grid(scene).is_some());
         let copier = copier.filter(|copier| !is_grid || copier.copies.of_grids).cloned();
-        Copying { channel, session_id: session.session_id.clone(), tip, copier, under_way: JoinSet::new() }
+        Copying { channel, session_id: session.session_id.clone(), instrument, copier, under_way: JoinSet::new() }
     }
 
     /// Returns whether this tissue is copied.
@@ -61,7 +66,8 @@ impl Copying {
         self.under_way.abort_all();
         self.under_way.detach_all();
         let Some(Copier { copies: Copies { make, .. }, places }) = self.copier.clone() else { return };
-        let (channel, session_id, tip) = (self.channel.clone(), self.session_id.clone(), self.tip);
+        let (channel, session_id, instrument) =
+            (self.channel.clone(), self.session_id.clone(), self.instrument.clone());
         self.under_way.spawn(async move {
             let none = |_| Error::Internal("no copy of the tissue is made any more".to_owned());
             let permit = places.acquire_owned().await.map_err(none)?;
@@ -69,7 +75,7 @@ impl Copying {
             let parts = SessionServiceClient::new(channel).save_snapshot(request).await?.into_inner();
             let bytes = snapshot::collect_within(parts, MAX_BYTES).await?;
             let none = |error| Error::Internal(format!("no thread for a copy of the tissue: {error}"));
-            let made = copy_thread::made_apart(move || make(&bytes, tip), permit).map_err(none)?;
+            let made = copy_thread::made_apart(move || make(&bytes, &instrument), permit).map_err(none)?;
             let panicked = |_| Error::Internal("making a copy of the tissue panicked".to_owned());
             made.await.map_err(panicked)?.map_err(Error::Argument)
         });

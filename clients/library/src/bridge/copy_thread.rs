@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_haptics::prediction::MAX_OTHERS;
-use palpate_haptics::{OtherTool, Predicted, Predictor};
+use palpate_haptics::{InstrumentPose, OtherTool, Predicted, Predictor};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 
 use crate::exchange::{NewestReader, NewestWriter, newest};
@@ -25,11 +25,11 @@ const ROUND: Duration = Duration::from_micros(200);
 const PATIENT_ROUNDS: u32 = 5000;
 const LONG_ROUND: Duration = Duration::from_millis(5);
 
-/// The place of the tool at a time, and the other tools.
+/// Where the tool is at a time, and the other tools.
 #[derive(Clone, Copy)]
-struct ToolPlace {
+struct ToolsThen {
     now_s: f64,
-    place_m: DVec3,
+    pose: InstrumentPose,
     others: [Option<OtherTool>; MAX_OTHERS],
 }
 
@@ -43,17 +43,17 @@ struct Felt {
 /// A copy that another thread steps. Its method takes a fixed number of operations. The thread ends after its current
 /// step when this is dropped.
 struct Stepped {
-    places: NewestWriter<ToolPlace>,
+    places: NewestWriter<ToolsThen>,
     felt: NewestReader<Felt>,
     is_over: Arc<AtomicBool>,
 }
 
 impl Predictor for Stepped {
-    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted> {
+    fn feel(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted> {
         self.felt.refresh();
         let Felt { now_s: then_s, felt } = *self.felt.read();
         self.places.write(|place| {
-            (place.now_s, place.place_m) = (now_s, place_m);
+            (place.now_s, place.pose) = (now_s, *pose);
             let others = others.iter().copied().map(Some).chain(std::iter::repeat(None));
             place.others.iter_mut().zip(others).for_each(|(place, other)| *place = other);
         });
@@ -69,7 +69,7 @@ impl Drop for Stepped {
 
 /// The end of the stepping thread.
 struct Stepper {
-    places: NewestReader<ToolPlace>,
+    places: NewestReader<ToolsThen>,
     /// The other tools at the newest place.
     others: Vec<OtherTool>,
     felt: NewestWriter<Felt>,
@@ -82,11 +82,11 @@ impl Stepper {
         if !self.places.refresh() {
             return false;
         }
-        let ToolPlace { now_s, place_m, others } = self.places.read();
+        let ToolsThen { now_s, pose, others } = self.places.read();
         self.others.clear();
         self.others.extend(others.iter().map_while(|other| *other));
         let now_s = *now_s;
-        let felt = copy.feel(now_s, *place_m, &self.others);
+        let felt = copy.feel(now_s, pose, &self.others);
         self.felt.write(|newest| *newest = Felt { now_s, felt });
         true
     }
@@ -111,7 +111,8 @@ impl Stepper {
 
 /// Creates the two ends of a copy.
 fn ends() -> (Stepped, Stepper) {
-    let (places, to_step) = newest(&ToolPlace { now_s: 0.0, place_m: DVec3::ZERO, others: [None; MAX_OTHERS] });
+    let (places, to_step) =
+        newest(&ToolsThen { now_s: 0.0, pose: InstrumentPose::at(DVec3::ZERO), others: [None; MAX_OTHERS] });
     let (told, felt) = newest(&Felt { now_s: f64::NEG_INFINITY, felt: None });
     let is_over = Arc::new(AtomicBool::new(false));
     let stepper =
@@ -147,21 +148,21 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use std::sync::mpsc;
 
-    use palpate_haptics::ContactState;
+    use palpate_haptics::{ContactState, Wrench};
     use tokio::sync::Semaphore;
 
     use super::*;
 
     fn pressed(place_m: DVec3) -> Predicted {
-        Predicted { force_n: -400.0 * place_m, contact_state: ContactState::Sticking, own_work_j: 0.0 }
+        Predicted { wrench: Wrench::of_force(-400.0 * place_m), contact_state: ContactState::Sticking, own_work_j: 0.0 }
     }
 
     /// A spring.
     struct CopySpring;
 
     impl Predictor for CopySpring {
-        fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
-            Some(pressed(place_m))
+        fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
+            Some(pressed(pose.place_m))
         }
     }
 
@@ -169,18 +170,19 @@ mod tests {
     fn a_tick_gets_what_was_felt_at_the_last_one_and_nothing_old() {
         let (mut stepped, mut stepper) = ends();
         let place_m = |tick: u32| DVec3::new(0.0, 0.0, -1e-4 * f64::from(tick));
+        let at = |tick: u32| InstrumentPose::at(place_m(tick));
         for tick in 0..50 {
-            let felt = stepped.feel(f64::from(tick) * 1e-3, place_m(tick), &[]);
+            let felt = stepped.feel(f64::from(tick) * 1e-3, &at(tick), &[]);
             assert_eq!(felt, tick.checked_sub(1).map(|last| pressed(place_m(last))));
             assert!(stepper.step(&mut CopySpring) && !stepper.step(&mut CopySpring));
         }
         // The thread is in a step that does not end.
         let felt: Vec<bool> =
-            (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, place_m(tick), &[]).is_some()).collect();
+            (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, &at(tick), &[]).is_some()).collect();
         assert_eq!(felt, [true, true, true, true, false, false, false, false, false, false]);
         // It continues with the newest place.
         assert!(stepper.step(&mut CopySpring));
-        assert_eq!(stepped.feel(0.060, place_m(60), &[]), Some(pressed(place_m(59))));
+        assert_eq!(stepped.feel(0.060, &at(60), &[]), Some(pressed(place_m(59))));
         drop(stepped);
         assert!(stepper.is_over());
     }
@@ -189,9 +191,9 @@ mod tests {
     struct Endless(mpsc::Receiver<()>);
 
     impl Predictor for Endless {
-        fn feel(&mut self, _: f64, place_m: DVec3, _: &[OtherTool]) -> Option<Predicted> {
+        fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
             let _ = self.0.recv();
-            Some(pressed(place_m))
+            Some(pressed(pose.place_m))
         }
     }
 
@@ -205,7 +207,10 @@ mod tests {
             let made = made_apart(move || Ok(Box::new(Endless(ended))), permit).unwrap();
             let mut copy = made.await.unwrap().unwrap();
             // This thread gets past although no step ends.
-            assert!((0..1000).all(|tick| copy.feel(f64::from(tick) * 1e-3, DVec3::ZERO, &[]).is_none()));
+            assert!(
+                (0..1000)
+                    .all(|tick| copy.feel(f64::from(tick) * 1e-3, &InstrumentPose::at(DVec3::ZERO), &[]).is_none())
+            );
             drop(copy);
             drop(end);
             // Once the step has ended, another copy can be built.

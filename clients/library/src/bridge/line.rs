@@ -5,11 +5,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_haptics::Device;
 use palpate_haptics::datagram_health::Carried;
 use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::{Device, Instrument};
 use palpate_proto::geometry::{from_vector, vector};
-use palpate_proto::{pb, touch};
+use palpate_proto::{instrument as of_instrument, pb, touch};
 use palpate_refusal::Reason;
 use palpate_refusal::status::elsewhere;
 use pb::command::Action;
@@ -116,13 +116,18 @@ const SILENCE: Duration = Duration::from_secs(2);
 /// busy machine; a client that gives up earlier makes it start again each time.
 const OPENING: Duration = Duration::from_secs(8);
 
+/// Number of steps between two samples of an instrument.
+const INSTRUMENT_EVERY: u32 = 5;
+
 /// Largest number of commands that wait for the stream.
 const COMMANDS: usize = 64;
 
 /// Keeps a connection open until `commands` ends; connects again whenever it breaks. Ends early if the first attempt
 /// is refused.
+#[allow(clippy::too_many_arguments)] // One caller, which has them all.
 pub(super) async fn keep(
     target: Target,
+    instrument: Option<Instrument>,
     copies: Option<Copies>,
     device: Device,
     shared: &Shared,
@@ -139,8 +144,18 @@ pub(super) async fn keep(
     let mut trail = Trail::new(target.server.clone().within(SILENCE));
     loop {
         let before = shared.inbound().traffic;
-        let ended =
-            connect(&target, copier.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
+        let ended = connect(
+            &target,
+            instrument.as_ref(),
+            copier.as_ref(),
+            &mut trail,
+            &device,
+            shared,
+            &mut feed,
+            &mut commands,
+            warn,
+        )
+        .await;
         let Err(error) = ended else { return };
         // After a move the tool is still in the tissue, and continues with its lease; not after any other break.
         let went_on = moved_to(&error).is_none() && !std::mem::take(&mut trail.lease_id).is_empty();
@@ -285,6 +300,7 @@ fn broken(why: &str) -> Error {
 #[allow(clippy::too_many_arguments)] // One caller, which has them all.
 async fn connect(
     target: &Target,
+    instrument: Option<&Instrument>,
     copier: Option<&Copier>,
     trail: &mut Trail,
     device: &Device,
@@ -295,13 +311,25 @@ async fn connect(
 ) -> Result<(), Error> {
     let At { server, channel, answer: session } = session(target, trail, shared).await?;
     let origin_m = origin_m(&session)?;
-    let mut copying = Copying::new(copier, &session, channel.clone(), target.tip);
+    let mut copying = Copying::new(
+        copier,
+        &session,
+        channel.clone(),
+        instrument.cloned().unwrap_or_else(|| Instrument::of_tip(target.tip)),
+    );
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
         session_id: session.session_id,
-        tools: vec![target.tool],
+        tools: (target.tool..).take(instrument.map_or(1, |instrument| instrument.tips.len())).collect(),
+        instruments: instrument
+            .map(|instrument| of_instrument::instrument(instrument, target.tool))
+            .into_iter()
+            .collect(),
+        // A copy is corrected by samples; each has all tips.
+        sample_every_steps: instrument.map(|_| INSTRUMENT_EVERY),
         holder: target.holder.clone(),
-        device: Some(touch::device(device)),
+        // A device gets local models of single tips.
+        device: instrument.is_none().then(|| touch::device(device)),
         deadband: (target.deadband > 0.0)
             .then(|| pb::Deadband { rendered_fraction: Some(target.deadband), ..Default::default() }),
         heartbeat_s: Some(HEARTBEAT_S),
@@ -318,7 +346,10 @@ async fn connect(
     let mut stream = tokio::time::timeout(OPENING, opening).await.map_err(silent)??;
     trail.lease_id.clone_from(&stream.opened().lease_id);
     stream.opened().warnings.iter().for_each(|warning| warn(warning));
-    let first = stream.opened().law.as_ref().ok_or_else(|| broken("the server sent no force law"))?;
+    let first = stream.opened().law.as_ref();
+    if first.is_none() && instrument.is_none() {
+        return Err(broken("the server sent no force law"));
+    }
     feed.begin(first, origin_m)?;
     // From now on the stream reports every change of the tissue.
     copying.begin();
@@ -399,11 +430,13 @@ async fn connect(
                 }
             }
             command = commands.recv() => {
-                let Some(ToolPose { client_time_ns, place_m, velocity_m_per_s }) = command else { return Ok(()) };
+                let Some(ToolPose { client_time_ns, pose, velocity_m_per_s }) = command else { return Ok(()) };
                 trail.sequence += 1;
                 let velocity_m_per_s = velocity_m_per_s.and_then(vector);
-                let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &target.tip) };
-                let action = Some(Action::Pose(pose));
+                let action = Some(match instrument {
+                    Some(_) => Action::Instrument(of_instrument::pose(&pose)),
+                    None => Action::Pose(pb::Pose { velocity_m_per_s, ..touch::pose(pose.place_m, &target.tip) }),
+                });
                 let (tool, sequence) = (target.tool, Some(trail.sequence));
                 let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
                 shared.inbound().traffic.poses += 1;

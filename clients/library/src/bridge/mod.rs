@@ -11,6 +11,7 @@ mod copy_thread;
 mod hands;
 mod lateness;
 mod line;
+mod loop_renderer;
 mod offline;
 mod tick;
 mod ticker;
@@ -20,7 +21,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use palpate_haptics::{Device, Envelope, Predictor, Tip};
+use palpate_haptics::{Device, Envelope, Instrument, Predictor, Tip};
 use palpate_refusal::printable::printable;
 use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
@@ -79,9 +80,9 @@ pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 /// A function that is called with the priority of a loop before it starts.
 pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
 
-/// A function that builds a copy of a tissue for a tool with this tip from the bytes of a snapshot (`SaveSnapshot`, at
+/// A function that builds a copy of a tissue for an instrument, which may be a single tip, from the bytes of a snapshot (`SaveSnapshot`, at
 /// most 64 MiB), or returns why it can't. It is called on a thread of its own, for one copy at a time.
-pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String> + Send + Sync>;
+pub type MakeCopy = Arc<dyn Fn(&[u8], &Instrument) -> Result<Box<dyn Predictor>, String> + Send + Sync>;
 
 /// Which tissues a loop copies, to render from the copy without the delay of the network
 /// ([`palpate_haptics::prediction`]).
@@ -113,7 +114,7 @@ impl Disable {
 
 /// Options of [`run`] and [`begin`]. By default there is no time limit, nothing is recorded or shown, the priority is
 /// the usual one, a created session is deleted at the end, and no tissue is copied. [`begin`] uses only
-/// `keeps_session`, `warn`, `copies` and `hand`.
+/// `keeps_session`, `warn`, `copies`, `hand` and `instrument`.
 #[derive(Default)]
 pub struct Options {
     /// Time after which [`run`] ends, from the first tick, which does not wait for a connection; `None`: no limit.
@@ -138,16 +139,22 @@ pub struct Options {
     /// One of the two hands of this client ([`two_hands`]), whose other one leads another tool of the same session: each copy of
     /// the tissue then has both tools without a delay. `None`: this device is the only one.
     pub hand: Option<BridgeHand>,
+    /// The instrument that the device leads, by its position, orientation and jaws; its tips are the tools from
+    /// [`Target::tool`] on. Force and torque come from a copy of the tissue, so `copies` is needed. `None`: the single tip of
+    /// [`Target::tip`].
+    pub instrument: Option<Instrument>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, copies, hand } = self;
+        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, copies, hand, instrument } =
+            self;
         let mut fields = f.debug_struct("Options");
         fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
         fields.field("keeps_session", keeps_session);
         fields.field("warn", &warn.is_some()).field("begun", &begun.is_some());
-        fields.field("copies", &copies.is_some()).field("hand", &hand.is_some()).finish()
+        fields.field("copies", &copies.is_some()).field("hand", &hand.is_some());
+        fields.field("instrument", instrument).finish()
     }
 }
 
@@ -172,6 +179,8 @@ pub struct BridgeReport {
     pub predicted_ticks: u64,
     /// The largest magnitude of a rendered force, N.
     pub most_force_n: f64,
+    /// The largest magnitude of a rendered torque, N·m; 0 without an instrument.
+    pub most_torque_n_m: f64,
     /// The priority with which the loop ran.
     pub priority: Priority,
     /// Totals of what was sent and received.
@@ -234,14 +243,15 @@ pub async fn run<D: HapticDevice + 'static>(
 pub async fn run_told<D: HapticDevice + 'static>(
     mut device: D,
     target: Target,
-    options: Options,
+    mut options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, BridgeReport), Error> {
-    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, copies, hand } = options;
+    let led = Led::of(&target, &mut options)?;
+    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, copies, .. } = options;
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
     let (ticker, mut line) =
-        line(target, copies, hand, descriptor, PositionOrigin::Workspace, keeps_session, warn.clone(), stop);
+        line(target, led, copies, descriptor, PositionOrigin::Workspace, keeps_session, warn.clone(), stop);
     let (news, of_loop) = (line.news.clone(), warn.clone());
     let (tell, ended) = oneshot::channel();
     std::thread::Builder::new().name("device".to_owned()).spawn(move || {
@@ -267,6 +277,7 @@ pub async fn run_told<D: HapticDevice + 'static>(
         lateness,
         predicted_ticks,
         most_force_n,
+        most_torque_n_m,
         ages_s,
         failure,
     } = served;
@@ -285,6 +296,7 @@ pub async fn run_told<D: HapticDevice + 'static>(
         tick_lateness_s: lateness.quantiles_s(),
         predicted_ticks,
         most_force_n,
+        most_torque_n_m,
         priority,
         traffic,
         made,
@@ -301,12 +313,41 @@ fn silent() -> Error {
     Error::Connection("never connected: the server did not answer in time".to_owned())
 }
 
+/// What a loop leads.
+struct Led {
+    hand: Option<BridgeHand>,
+    instrument: Option<Instrument>,
+}
+
+impl Led {
+    /// # Errors
+    /// Returns [`Error::Argument`] for an instrument without tips or without a copy of the tissue, whose tools have no numbers, or that
+    /// is one of two hands.
+    fn of(target: &Target, options: &mut Options) -> Result<Self, Error> {
+        let Options { hand, instrument, copies, .. } = options;
+        let refuse = |why: &str| Err(Error::Argument(format!("instrument: {why}")));
+        if let Some(instrument) = instrument {
+            let tips = u32::try_from(instrument.tips.len()).unwrap_or(u32::MAX);
+            if tips == 0 || target.tool.checked_add(tips).is_none() {
+                return refuse("has no tips, or its tools no numbers");
+            }
+            if copies.is_none() {
+                return refuse("is rendered from a copy of the tissue: allow copies");
+            }
+            if hand.is_some() {
+                return refuse("can't be one of two hands: connect each hand by a bridge of its own");
+            }
+        }
+        Ok(Led { hand: hand.take(), instrument: instrument.take() })
+    }
+}
+
 /// Starts to connect in a task. Returns the half of the loop and the connection.
 #[allow(clippy::too_many_arguments)] // Its callers have them all.
 fn line(
     target: Target,
+    led: Led,
     copies: Option<Copies>,
-    hand: Option<BridgeHand>,
     device: Device,
     origin: PositionOrigin,
     keeps_session: bool,
@@ -315,7 +356,8 @@ fn line(
 ) -> (Ticker, Connection) {
     let server = target.server.clone();
     let (ticker, feed, queue) = ticker::ticker(device, origin, target.up_deadband);
-    let ticker = ticker.of_hand(hand, target.tool, target.tip);
+    let Led { hand, instrument } = led;
+    let ticker = ticker.of_hand(hand, target.tool, target.tip).of_instrument(instrument.clone());
     let (shared, news) = (Arc::new(Shared::default()), Arc::new(Notify::new()));
     let commands = Commands { queue, news: news.clone() };
     let mut network = JoinSet::new();
@@ -325,7 +367,7 @@ fn line(
             // The text may contain parts that a server has written.
             let warn = |message: &str| warn.iter().for_each(|warn| warn(&printable(message)));
             tokio::select! {
-                () = line::keep(target, copies, device, &shared, feed, commands, &warn) => {}
+                () = line::keep(target, instrument, copies, device, &shared, feed, commands, &warn) => {}
                 // The loop then detects that it is over.
                 () = stop => {}
             }
@@ -339,7 +381,7 @@ const ROUND: Duration = Duration::from_micros(250);
 
 /// Connects a loop of your own to `target`. Waits for the first connection, at most ten seconds; later ones are
 /// opened automatically. `device` describes the limits of the forces; it is also sent to the server. `origin` is the
-/// frame of the readings. Of `options`, only `keeps_session`, `warn`, `copies` and `hand` are used. Call it within a Tokio
+/// frame of the readings. Of `options`, only `keeps_session`, `warn`, `copies`, `hand` and `instrument` are used. Call it within a Tokio
 /// runtime, which must run as long as the connection.
 ///
 /// A tick wakes no thread, because that would be a call of the system. A courier thread notices within a quarter of a
@@ -352,11 +394,12 @@ pub async fn begin(
     target: Target,
     device: Device,
     origin: PositionOrigin,
-    options: Options,
+    mut options: Options,
 ) -> Result<(Ticker, Connection), Error> {
-    let Options { keeps_session, warn, copies, hand, .. } = options;
+    let led = Led::of(&target, &mut options)?;
+    let Options { keeps_session, warn, copies, .. } = options;
     let (ticker, mut line) =
-        line(target, copies, hand, device, origin, keeps_session, Arc::new(warn), std::future::pending());
+        line(target, led, copies, device, origin, keeps_session, Arc::new(warn), std::future::pending());
     let (commands, news) = (ticker.commands_view(), line.news.clone());
     std::thread::Builder::new().name("bridge-wake".to_owned()).spawn(move || {
         while !commands.is_over() {

@@ -65,7 +65,7 @@ impl OfflineNetwork {
         match response.message {
             Some(Heard::Opened(opened)) => {
                 let law = opened.law.ok_or_else(|| Error::Argument("`opened` has no force law".to_owned()))?;
-                self.feed.begin(&law, self.origin_m)
+                self.feed.begin(Some(&law), self.origin_m)
             }
             Some(Heard::ForceLaw(update)) => update.law.iter().try_for_each(|law| self.feed.learn(law)),
             Some(Heard::Sample(sample)) => {

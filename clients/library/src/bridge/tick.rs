@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_haptics::{Envelope, RenderingState};
+use palpate_haptics::{Envelope, RenderingState, Wrench};
 use tokio::sync::Notify;
 
 use super::Disable;
@@ -48,8 +48,9 @@ pub(super) struct Served {
     pub(super) lateness: TickLateness,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub(super) predicted_ticks: u64,
-    /// The largest rendered force, N.
+    /// The largest rendered force, N, and torque, N·m.
     pub(super) most_force_n: f64,
+    pub(super) most_torque_n_m: f64,
     /// Age of the local model at each tick, s; empty unless the loop was to record it.
     pub(super) ages_s: Vec<f64>,
     /// The error of the device, if it failed.
@@ -69,7 +70,7 @@ pub(super) fn serve(
     let mut served = Served::default();
     served.failure = tick(device, &mut ticker, news, disable, lasts, remember, &mut served).err();
     // A device holds its last force until it gets another.
-    let _ = device.write(DVec3::ZERO);
+    let _ = if ticker.has_instrument() { device.write_wrench(Wrench::default()) } else { device.write(DVec3::ZERO) };
     served.envelope = ticker.envelope().cloned();
     served.predicted_ticks = ticker.predicted();
     drop(ticker);
@@ -89,7 +90,7 @@ fn tick(
     remember: bool,
     served: &mut Served,
 ) -> std::io::Result<()> {
-    let Served { course, late_ticks, missed_ticks, lateness, ages_s, most_force_n, .. } = served;
+    let Served { course, late_ticks, missed_ticks, lateness, ages_s, most_force_n, most_torque_n_m, .. } = served;
     let start = Instant::now();
     let mut due = start;
     // If a tick is much too late, later ones are timed from it.
@@ -118,9 +119,15 @@ fn tick(
         if disable.take() {
             ticker.disable();
         }
-        let force_n = ticker.tick(reading, time_s);
-        device.write(force_n)?;
+        let wrench = ticker.tick_turned(reading, device.orientation(), device.jaw_rad(), time_s);
+        let force_n = wrench.force_n;
+        if ticker.has_instrument() {
+            device.write_wrench(wrench)?;
+        } else {
+            device.write(force_n)?;
+        }
         *most_force_n = most_force_n.max(force_n.length());
+        *most_torque_n_m = most_torque_n_m.max(wrench.torque_n_m.length());
         if ticker.has_spoken() {
             news.notify_one();
         }
@@ -210,7 +217,7 @@ mod tests {
     fn a_slow_reading_is_no_reason_for_a_step_at_the_next_tick() {
         let mut device = Slow { ticks: 0, forces: Vec::new() };
         let (ticker, mut feed, _commands) = ticker(device.descriptor(), PositionOrigin::Workspace, 0.0);
-        feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
+        feed.begin(Some(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0)), DVec3::ZERO).unwrap();
         let lasts = Some(Duration::from_millis(300));
         let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), lasts, true);
         assert!(served.missed_ticks >= 199, "{}", served.missed_ticks);
@@ -226,7 +233,7 @@ mod tests {
     fn a_device_that_fails_is_left_without_a_force() {
         let mut device = Failing { ticks: 0, force_n: DVec3::X };
         let (ticker, mut feed, _commands) = ticker(device.descriptor(), PositionOrigin::Workspace, 0.0);
-        feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
+        feed.begin(Some(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0)), DVec3::ZERO).unwrap();
         let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), None, true);
         assert_eq!(served.failure.map(|error| error.kind()), Some(std::io::ErrorKind::BrokenPipe));
         // The results until then are returned.

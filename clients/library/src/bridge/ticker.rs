@@ -4,29 +4,30 @@
 //! kept (`exchange`). A tick allocates and frees no memory: laws that are no longer needed go back to the network
 //! side.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use palpate_haptics::dead_reckoning::News;
 use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_haptics::prediction::{MAX_OTHERS, midway_s};
 use palpate_haptics::renderer::MAX_LAWS;
 use palpate_haptics::{
-    Device, Envelope, Law, LocalModel, MotionState, OtherTool, Prediction, Predictor, Renderer, RenderingState, Tip,
+    Device, Envelope, Instrument, InstrumentPose, InstrumentRenderer, Law, MotionState, OtherTool, Prediction,
+    Predictor, Renderer, RenderingState, Tip, Wrench,
 };
-use palpate_proto::{pb, touch};
+use palpate_proto::{instrument, pb, touch};
 use std::collections::VecDeque;
 
 use super::hands::BridgeHand;
+use super::loop_renderer::{LoopRenderer, NewestSample};
 use crate::Error;
 use crate::device::Reading;
 use crate::exchange::{NewestReader, NewestWriter, QueueReader, QueueView, QueueWriter, newest, queue};
 
-/// The place of a tool at a time.
+/// Where a tool is at a time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ToolPose {
     /// Time of the client's clock, ns.
     pub(super) client_time_ns: u64,
-    /// Position, m.
-    pub(super) place_m: DVec3,
+    pub(super) pose: InstrumentPose,
     /// Velocity, m/s, if the server is to extrapolate the motion.
     pub(super) velocity_m_per_s: Option<DVec3>,
 }
@@ -53,8 +54,8 @@ enum Used {
 #[derive(Clone, Copy)]
 struct Newest {
     connection: u64,
-    model: Option<LocalModel>,
-    /// The other tools at the time of the model, and their number.
+    sample: Option<NewestSample>,
+    /// The other tools at the time of the sample, and their number.
     others: [Option<OtherTool>; MAX_OTHERS],
     /// The longest time between two poses that the server wants, s; 0 before it has sent one.
     wanted_s: f64,
@@ -97,7 +98,9 @@ pub struct Ticker {
     /// Number of the last [`LoopEvent::Begin`]; 0 before the first.
     connection: u64,
     origin_m: DVec3,
-    renderer: Renderer,
+    renderer: LoopRenderer,
+    /// The instrument that the device leads; `None`: a single tip.
+    instrument: Option<Instrument>,
     was_asked: bool,
     news: News,
     clock: Clock,
@@ -119,7 +122,7 @@ pub(super) struct LoopFeed {
     connection: u64,
     /// Events that did not fit into the queue yet.
     waiting: VecDeque<LoopEvent>,
-    model: Option<LocalModel>,
+    sample: Option<NewestSample>,
     others: [Option<OtherTool>; MAX_OTHERS],
     wanted_s: f64,
 }
@@ -134,7 +137,7 @@ pub(super) fn ticker(
     let (used, back) = queue(USED);
     let (commands, received) = queue(COMMANDS);
     let (newest_writer, newest_reader) =
-        newest(&Newest { connection: 0, model: None, others: [None; MAX_OTHERS], wanted_s: 0.0 });
+        newest(&Newest { connection: 0, sample: None, others: [None; MAX_OTHERS], wanted_s: 0.0 });
     let ticker = Ticker {
         told,
         newest: newest_reader,
@@ -148,7 +151,8 @@ pub(super) fn ticker(
         connection: 0,
         origin_m: DVec3::ZERO,
         // This law is not used before the first connection.
-        renderer: Renderer::new(Law::linear(0.0, 0.0), Envelope::new(device, DVec3::ZERO)),
+        renderer: LoopRenderer::Tip(Box::new(Renderer::new(Law::linear(0.0, 0.0), Envelope::new(device, DVec3::ZERO)))),
+        instrument: None,
         was_asked: false,
         news: News::default(),
         clock: Clock::default(),
@@ -163,7 +167,7 @@ pub(super) fn ticker(
         used: back,
         connection: 0,
         waiting: VecDeque::new(),
-        model: None,
+        sample: None,
         others: [None; MAX_OTHERS],
         wanted_s: 0.0,
     };
@@ -205,6 +209,17 @@ impl Ticker {
         Ticker { hand: hand.map(|hand| (hand, tool, tip)), ..self }
     }
 
+    /// Returns this loop as that of a device that leads an instrument, if there is one.
+    #[must_use]
+    pub(super) fn of_instrument(self, instrument: Option<Instrument>) -> Self {
+        if instrument.is_none() {
+            return self;
+        }
+        let envelope = Envelope::new(self.device, DVec3::ZERO);
+        let renderer = LoopRenderer::Instrument(Box::new(InstrumentRenderer::new(envelope)));
+        Ticker { renderer, instrument, ..self }
+    }
+
     /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`, s. The times may
     /// have any origin and must advance between ticks. Returns zero before the first connection. Queues a pose for the
     /// network; drops it if 64 wait. A change of [`Reading::enable`] from false to true enables forces.
@@ -213,6 +228,13 @@ impl Ticker {
     /// of the tissue. Ticks may be late, early or missing: the envelope takes the time since the last one into
     /// account.
     pub fn tick(&mut self, reading: Reading, time_s: f64) -> DVec3 {
+        self.tick_turned(reading, DQuat::IDENTITY, 0.0, time_s).force_n
+    }
+
+    /// Does a tick as [`Ticker::tick`] does, for a device that also has an orientation, of length 1, and an angle between jaws, rad.
+    /// Returns force and torque to render from now on, the torque about the place of the reading; no torque for a single tip, or if
+    /// the device renders none.
+    pub fn tick_turned(&mut self, reading: Reading, orientation: DQuat, jaw_rad: f64, time_s: f64) -> Wrench {
         let now_s = self.clock.at(time_s);
         self.is_fresh |= self.newest.refresh();
         self.learn();
@@ -224,19 +246,26 @@ impl Ticker {
         let (was_asked, place_m) = (std::mem::replace(&mut self.was_asked, reading.enable), self.place_m);
         // Before the first connection the place of the tissue is not known.
         if self.connection == 0 {
-            return DVec3::ZERO;
+            return Wrench::default();
         }
+        let pose = match &self.instrument {
+            Some(instrument) => {
+                // A device may have a gripper, and its instrument no jaws.
+                let jaw_rad = if instrument.has_jaws() { jaw_rad } else { 0.0 };
+                instrument.lead(&InstrumentPose { place_m, orientation, jaw_rad })
+            }
+            None => InstrumentPose::at(place_m),
+        };
         let renderer = &mut self.renderer;
         if reading.enable && !was_asked {
-            renderer.envelope.reset();
-            renderer.envelope.enable();
+            renderer.envelope_mut().reset();
+            renderer.envelope_mut().enable();
         }
-        let Newest { connection, model, others, wanted_s } = self.newest.read();
+        let Newest { connection, sample, others, wanted_s } = self.newest.read();
         let (connection, wanted_s) = (*connection, *wanted_s);
         let is_news = self.is_fresh && connection == self.connection;
-        if let Some(model) = model.filter(|_| is_news) {
-            self.others_time_s = Some(midway_s(model.client_time_s, now_s));
-            renderer.receive(model, now_s);
+        if let Some(time_s) = sample.filter(|_| is_news).and_then(|sample| renderer.receive(&sample, now_s)) {
+            self.others_time_s = Some(midway_s(time_s, now_s));
         }
         self.is_fresh &= !is_news;
         let of_time = |other: OtherTool, time_s| OtherTool { motion: MotionState { time_s, ..other.motion }, ..other };
@@ -256,22 +285,22 @@ impl Ticker {
             }
             renderer.follow_others(&self.others);
         }
-        let force_n = renderer.tick(now_s, place_m);
-        if !(place_m.is_finite() && now_s.is_finite()) {
-            return force_n;
+        let wrench = renderer.tick(now_s, &pose);
+        if !(pose.is_finite() && now_s.is_finite()) {
+            return wrench;
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let client_time_ns = (now_s * 1e9) as u64;
-        let command = if self.up_deadband > 0.0 {
+        let command = if let Some(way_m) = renderer.way_m(self.up_deadband) {
             let heartbeat_s = if connection == self.connection && wanted_s > 0.0 { wanted_s } else { HEARTBEAT_S };
-            let told = self.news.tell(now_s, place_m, renderer.way_m(self.up_deadband), heartbeat_s);
-            told.map(|told| ToolPose { client_time_ns, place_m, velocity_m_per_s: Some(told.velocity_m_per_s) })
+            let told = self.news.tell(now_s, place_m, way_m, heartbeat_s);
+            told.map(|told| ToolPose { client_time_ns, pose, velocity_m_per_s: Some(told.velocity_m_per_s) })
         } else {
-            Some(ToolPose { client_time_ns, place_m, velocity_m_per_s: None })
+            Some(ToolPose { client_time_ns, pose, velocity_m_per_s: None })
         };
         // If the network does not keep up, this position is dropped; the next one replaces it.
         self.has_spoken = command.is_some_and(|command| self.commands.push(command).is_ok());
-        force_n
+        wrench
     }
 
     /// Applies the events since the last tick, as long as there is room to give back what they replace.
@@ -289,7 +318,7 @@ impl Ticker {
                     self.renderer.begin_with(law, |law| give_back(Used::Law(law)));
                     self.renderer.predict(None).into_iter().for_each(|copy| give_back(Used::Copy(copy)));
                     if self.connection == 0 {
-                        self.renderer.envelope = Envelope::new(self.device, origin_m);
+                        *self.renderer.envelope_mut() = Envelope::new(self.device, origin_m);
                     }
                     // The envelope of an earlier connection stays: a pause remains, and a rendered force falls at the
                     // slew limit.
@@ -313,7 +342,7 @@ impl Ticker {
     /// Stops rendering until [`Reading::enable`] changes from false to true again. The force falls to zero within the
     /// next ticks, at the envelope's slew limit.
     pub fn disable(&mut self) {
-        self.renderer.envelope.disable();
+        self.renderer.envelope_mut().disable();
     }
 
     /// Returns whether forces are rendered; `None` before the first connection.
@@ -336,13 +365,18 @@ impl Ticker {
     /// Returns the limits that act on the forces, in their current state; `None` before the first tick of the first
     /// connection. It stays over later connections.
     pub fn envelope(&self) -> Option<&Envelope> {
-        (self.connection > 0).then_some(&self.renderer.envelope)
+        (self.connection > 0).then(|| self.renderer.envelope())
     }
 
     /// Returns whether the network side has ended for good: its half was dropped or ended, or the server refused the
     /// first connection. Forces then fade, and no tick changes that.
     pub fn is_over(&self) -> bool {
         self.commands.is_over()
+    }
+
+    /// Returns whether the device leads an instrument.
+    pub(super) fn has_instrument(&self) -> bool {
+        self.instrument.is_some()
     }
 
     /// Returns whether the last tick had something to send.
@@ -371,14 +405,15 @@ fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
 }
 
 impl LoopFeed {
-    /// Starts a new connection to a tissue; the middle of the device's workspace is placed at `origin_m`, m.
+    /// Starts a new connection to a tissue, with its law if a single tip is led; the middle of the device's workspace is placed at `origin_m`, m.
     ///
     /// # Errors
     /// Returns an error if the law can't be used.
-    pub(super) fn begin(&mut self, message: &pb::ForceLaw, origin_m: DVec3) -> Result<(), Error> {
-        let law = law(message)?;
+    pub(super) fn begin(&mut self, message: Option<&pb::ForceLaw>, origin_m: DVec3) -> Result<(), Error> {
+        // The loop of an instrument uses no law.
+        let law = message.map_or(Ok(Law::linear(0.0, 0.0)), law)?;
         self.connection += 1;
-        (self.model, self.wanted_s) = (None, 0.0);
+        (self.sample, self.wanted_s) = (None, 0.0);
         // Drops what the ticks have not taken of the connection before.
         self.waiting.clear();
         self.waiting.push_back(LoopEvent::Begin { connection: self.connection, law, origin_m });
@@ -410,17 +445,21 @@ impl LoopFeed {
         self.pass_on();
     }
 
-    /// Takes the local model of the tool and the other tools from a sample, and the interval at which the server wants poses, s.
+    /// Takes the local model of the tool, or the wrench on the instrument, and the other tools from a sample, and the interval at which the server wants poses, s.
     pub(super) fn receive(&mut self, sample: &pb::Sample, wanted_s: f64) {
         self.wanted_s = wanted_s;
-        if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
-            let model = touch::from_local_model(model, sample.step);
-            if self.model.is_none_or(|newest| newest.sequence < model.sequence) {
-                self.model = Some(model);
-                let others = sample.other_tools.iter().map(|other| touch::from_other_tool(other, model.client_time_s));
-                self.others = [None; MAX_OTHERS];
-                self.others.iter_mut().zip(others.flatten()).for_each(|(place, other)| *place = Some(other));
-            }
+        let model = sample.tools.first().and_then(|tool| tool.local_model.as_ref());
+        let model = model.map(|model| touch::from_local_model(model, sample.step));
+        let wrench = sample.instruments.first().map(|felt| instrument::from_sample(felt, sample.step));
+        let told = wrench.map(|wrench| (NewestSample::Wrench(wrench), wrench.client_time_s));
+        let told = told.or_else(|| model.map(|model| (NewestSample::Model(model), model.client_time_s)));
+        if let Some((told, time_s)) = told
+            && self.sample.is_none_or(|newest| newest.sequence() < told.sequence())
+        {
+            self.sample = Some(told);
+            let others = sample.other_tools.iter().map(|other| touch::from_other_tool(other, time_s));
+            self.others = [None; MAX_OTHERS];
+            self.others.iter_mut().zip(others.flatten()).for_each(|(place, other)| *place = Some(other));
         }
         self.pass_on();
     }
@@ -434,8 +473,8 @@ impl LoopFeed {
                 return;
             }
         }
-        let Self { connection, model, others, wanted_s, .. } = *self;
-        let newest = Newest { connection, model, others, wanted_s };
+        let Self { connection, sample, others, wanted_s, .. } = *self;
+        let newest = Newest { connection, sample, others, wanted_s };
         self.newest.write(|place| *place = newest);
     }
 }
@@ -443,7 +482,7 @@ impl LoopFeed {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use palpate_haptics::{ContactState, Predicted};
+    use palpate_haptics::{ContactState, InstrumentPose, Predicted, Wrench};
 
     use super::super::hands::two_hands;
     use super::*;
@@ -452,9 +491,9 @@ mod tests {
     struct TellingCopy(NewestWriter<Vec<OtherTool>>);
 
     impl Predictor for TellingCopy {
-        fn feel(&mut self, _: f64, _: DVec3, others: &[OtherTool]) -> Option<Predicted> {
+        fn feel(&mut self, _: f64, _: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted> {
             self.0.write(|told| *told = others.to_vec());
-            Some(Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free, own_work_j: 0.0 })
+            Some(Predicted { wrench: Wrench::default(), contact_state: ContactState::Free, own_work_j: 0.0 })
         }
     }
 
@@ -481,13 +520,13 @@ mod tests {
             assert!(told.refresh());
             told.read().clone()
         };
-        left_feed.begin(&law, DVec3::ZERO).unwrap();
+        left_feed.begin(Some(&law), DVec3::ZERO).unwrap();
         left_feed.predict(Some(Box::new(TellingCopy(say))));
         let at = |x_m: f64| Reading { place_m: DVec3::new(x_m, 0.0, 0.0), enable: true };
         left.tick(at(0.0), 0.000);
         // The other hand has no connection yet.
         assert_eq!(heard(), []);
-        right_feed.begin(&law, DVec3::ZERO).unwrap();
+        right_feed.begin(Some(&law), DVec3::ZERO).unwrap();
         right.tick(at(0.02), 0.0005);
         left.tick(at(0.0), 0.001);
         let [other] = heard()[..] else { panic!("one other tool") };

@@ -12,9 +12,10 @@ use std::ffi::{c_char, c_int, c_uchar};
 use std::io;
 use std::path::Path;
 
-use glam::DVec3;
-use palpate_haptics::Device;
+use glam::{DMat3, DQuat, DVec3};
 use palpate_haptics::device::UNDECLARED;
+use palpate_haptics::instrument_pose::MAX_JAW_RAD;
+use palpate_haptics::{Device, Wrench};
 
 use super::loaded::{Loaded, text_of};
 use crate::device::{HapticDevice, Reading};
@@ -58,6 +59,10 @@ type ByDevice = unsafe extern "system" fn(c_char) -> c_int;
 type Text = unsafe extern "system" fn(c_char) -> *const c_char;
 type Get3 = unsafe extern "system" fn(*mut f64, *mut f64, *mut f64, c_char) -> c_int;
 type Set3 = unsafe extern "system" fn(f64, f64, f64, c_char) -> c_int;
+type Set6 = unsafe extern "system" fn(f64, f64, f64, f64, f64, f64, c_char) -> c_int;
+
+/// The handle's axes as those of an instrument: that points away from the operator, which is the handle's −x, with z up.
+const HANDLE: DMat3 = DMat3::from_cols(DVec3::NEG_X, DVec3::NEG_Y, DVec3::Z);
 
 /// The functions of the SDK that are used.
 #[derive(Debug, Clone, Copy)]
@@ -72,6 +77,10 @@ struct LibraryCalls {
     position: Get3,
     button: unsafe extern "system" fn(c_int, c_char) -> c_int,
     set_force: Set3,
+    /// By rows: the handle's axes in the base's frame are its columns.
+    orientation: Option<unsafe extern "system" fn(*mut [[f64; 3]; 3], c_char) -> c_int>,
+    gripper: Option<unsafe extern "system" fn(*mut f64, c_char) -> c_int>,
+    set_wrench: Option<Set6>,
     last_error: unsafe extern "system" fn() -> *const c_char,
     /// Since SDK 3.9.
     get_most: Option<unsafe extern "system" fn(c_char) -> f64>,
@@ -95,6 +104,9 @@ impl LibraryCalls {
                 position: loaded.function("dhdGetPosition")?,
                 button: loaded.function("dhdGetButton")?,
                 set_force: loaded.function("dhdSetForce")?,
+                orientation: loaded.optional("dhdGetOrientationFrame"),
+                gripper: loaded.optional("dhdGetGripperAngleRad"),
+                set_wrench: loaded.optional("dhdSetForceAndTorque"),
                 last_error: loaded.function("dhdErrorGetLastStr")?,
                 get_most: loaded.optional("dhdGetMaxForce"),
                 set_most: loaded.optional("dhdSetMaxForce"),
@@ -133,6 +145,17 @@ pub(super) struct ForceDimension {
     model: String,
     descriptor: Device,
     buttons: u32,
+    orientation: DQuat,
+    jaw_rad: f64,
+}
+
+/// Converts a vector of the base's frame to the device's, and back.
+fn of_device(base: DVec3) -> DVec3 {
+    DVec3::new(base.y, -base.x, base.z)
+}
+
+fn of_base(device: DVec3) -> DVec3 {
+    DVec3::new(-device.y, device.x, device.z)
 }
 
 impl ForceDimension {
@@ -172,8 +195,12 @@ impl ForceDimension {
             descriptor.force_n = descriptor.force_n.min(most_n);
             descriptor.continuous_n = descriptor.continuous_n.min(most_n);
         }
+        if calls.set_wrench.is_none() {
+            descriptor.torque_n_m = 0.0;
+        }
         let model = model.unwrap_or_else(|| format!("system {system}"));
-        let mut device = ForceDimension { calls, id, model, descriptor, buttons: 0 };
+        let (orientation, jaw_rad) = (DQuat::IDENTITY, 0.0);
+        let mut device = ForceDimension { calls, id, model, descriptor, buttons: 0, orientation, jaw_rad };
         // A second limit, in the SDK, in addition to our envelope.
         // SAFETY: as above.
         calls.set_most.map(|set| unsafe { set(descriptor.most_n(), id) });
@@ -182,6 +209,25 @@ impl ForceDimension {
         device.hold(unsafe { (calls.enable_force)(ON, id) }, "its forces can't be enabled")?;
         device.write(DVec3::ZERO)?;
         Ok(device)
+    }
+
+    /// Reads orientation and gripper. A device without them keeps the neutral ones.
+    fn read_handle(&mut self) {
+        let mut rows = [[0.0; 3]; 3];
+        // SAFETY: room for nine numbers that live during the call, and the device is open.
+        let told = self.calls.orientation.map(|get| unsafe { get(&raw mut rows, self.id) });
+        let handle = DMat3::from_cols_array_2d(&rows).transpose() * HANDLE;
+        let axes = [handle.x_axis, handle.y_axis, handle.z_axis].map(of_device);
+        let is_rotation = (handle.determinant() - 1.0).abs() < 1e-3;
+        if told.is_some_and(|told| told >= 0) && is_rotation {
+            self.orientation = DQuat::from_mat3(&DMat3::from_cols(axes[0], axes[1], axes[2])).normalize();
+        }
+        let mut angle_rad = 0.0;
+        // SAFETY: a number that lives during the call, and the device is open.
+        let told = self.calls.gripper.map(|get| unsafe { get(&raw mut angle_rad, self.id) });
+        if told.is_some_and(|told| told >= 0) && angle_rad.is_finite() {
+            self.jaw_rad = angle_rad.clamp(0.0, MAX_JAW_RAD);
+        }
     }
 
     /// Returns an error if a call failed.
@@ -208,13 +254,34 @@ impl HapticDevice for ForceDimension {
         // SAFETY: as above.
         let pressed = |index| unsafe { (self.calls.button)(index, self.id) } == 1;
         self.buttons = (0..BUTTONS).filter(|index| pressed(*index)).map(|index| 1 << index).sum();
-        Ok(Reading { place_m: DVec3::new(y, -x, z), enable: self.buttons & 1 != 0 })
+        self.read_handle();
+        Ok(Reading { place_m: of_device(DVec3::new(x, y, z)), enable: self.buttons & 1 != 0 })
     }
 
     fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        let DVec3 { x, y, z } = of_base(force_n);
         // SAFETY: the device is open.
-        let returned = unsafe { (self.calls.set_force)(-force_n.y, force_n.x, force_n.z, self.id) };
+        let returned = unsafe { (self.calls.set_force)(x, y, z, self.id) };
         self.hold(returned, "its force can't be set")
+    }
+
+    fn orientation(&self) -> DQuat {
+        self.orientation
+    }
+
+    fn jaw_rad(&self) -> f64 {
+        self.jaw_rad
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> io::Result<()> {
+        let Some(set) = self.calls.set_wrench.filter(|_| self.descriptor.torque_n_m > 0.0) else {
+            return self.write(wrench.force_n);
+        };
+        let (force_n, torque_n_m) = (of_base(wrench.force_n), of_base(wrench.torque_n_m));
+        // SAFETY: the device is open.
+        let returned =
+            unsafe { set(force_n.x, force_n.y, force_n.z, torque_n_m.x, torque_n_m.y, torque_n_m.z, self.id) };
+        self.hold(returned, "its force and torque can't be set")
     }
 
     fn buttons(&self) -> u32 {
@@ -228,10 +295,13 @@ impl HapticDevice for ForceDimension {
 
 impl Drop for ForceDimension {
     fn drop(&mut self) {
-        let LibraryCalls { set_force, enable_force, close, .. } = self.calls;
+        let LibraryCalls { set_force, set_wrench, enable_force, close, .. } = self.calls;
         // SAFETY: the device is open, and nothing uses it after this.
         unsafe {
-            set_force(0.0, 0.0, 0.0, self.id);
+            match set_wrench.filter(|_| self.descriptor.torque_n_m > 0.0) {
+                Some(set) => set(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.id),
+                None => set_force(0.0, 0.0, 0.0, self.id),
+            };
             enable_force(OFF, self.id);
             close(self.id);
         }

@@ -13,8 +13,8 @@ use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use glam::DVec3;
-use palpate_haptics::Device;
+use glam::{DMat3, DQuat, DVec3};
+use palpate_haptics::{Device, Wrench};
 
 use super::loaded::{Loaded, text_of};
 use crate::device::{HapticDevice, Reading};
@@ -28,7 +28,9 @@ const NAMES: [&str; 3] = ["libHD.so", "libHD.so.3.4", "libHD.so.3"];
 const INVALID_HANDLE: c_uint = 0xFFFF_FFFF;
 const CURRENT_BUTTONS: c_uint = 0x2000;
 const CURRENT_POSITION: c_uint = 0x2050;
+const CURRENT_TRANSFORM: c_uint = 0x2052;
 const CURRENT_FORCE: c_uint = 0x2700;
+const CURRENT_TORQUE: c_uint = 0x2701;
 const VERSION: c_uint = 0x2500;
 const MODEL: c_uint = 0x2501;
 const MAX_WORKSPACE: c_uint = 0x2550;
@@ -37,6 +39,7 @@ const MAX_STIFFNESS: c_uint = 0x2602;
 const MAX_FORCE: c_uint = 0x2603;
 const MAX_CONTINUOUS_FORCE: c_uint = 0x2604;
 const MAX_DAMPING: c_uint = 0x2609;
+const MAX_TORQUE: c_uint = 0x2622;
 const FORCE_OUTPUT: c_uint = 0x4000;
 const NEEDS_INKWELL: c_uint = 0x5002;
 const CALLBACK_DONE: c_uint = 0;
@@ -53,6 +56,9 @@ const STILL: Duration = Duration::from_millis(50);
 
 /// Time without a frame after which the device counts as gone.
 const GONE: Duration = Duration::from_millis(500);
+
+/// The stylus's axes as those of an instrument: that points along the stylus, which is its −z, with the stylus's y as z.
+const STYLUS: DMat3 = DMat3::from_cols(DVec3::NEG_Z, DVec3::NEG_X, DVec3::Y);
 
 /// Longest time for which closing waits for frames that set no force.
 const CLOSES: Duration = Duration::from_millis(250);
@@ -169,8 +175,11 @@ struct Exchange {
     /// Position in the library's axes, mm.
     place_mm: [f64; 3],
     buttons: c_int,
-    /// Force in the library's axes, N.
+    /// Axes of the stylus in the library's axes, by columns.
+    stylus: [f64; 9],
+    /// Force, N, and torque, mN·m, in the library's axes; no torque: the device renders none.
     force_n: [f64; 3],
+    torque_mn_m: Option<[f64; 3]>,
     written: Instant,
     /// When the newest frame arrived; `None` before the first.
     came: Option<Instant>,
@@ -202,25 +211,32 @@ unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
     // SAFETY: `open` passes a `SharedState` that is never freed.
     let shared = unsafe { &*shared.cast::<SharedState>() };
     let SharedState { calls, handle, .. } = shared;
-    let mut place_mm = [0.0; 16];
+    let (mut place_mm, mut transform) = ([0.0; 16], [0.0; 16]);
     let mut buttons = 0;
     // SAFETY: the device is open; there is room for the numbers.
     unsafe {
         (calls.begin)(*handle);
         (calls.get_numbers)(CURRENT_POSITION, place_mm.as_mut_ptr());
+        (calls.get_numbers)(CURRENT_TRANSFORM, transform.as_mut_ptr());
         (calls.get_whole)(CURRENT_BUTTONS, &raw mut buttons);
     }
-    let force_n = {
+    let (force_n, torque_mn_m) = {
         let mut exchange = shared.exchange();
         exchange.place_mm = [place_mm[0], place_mm[1], place_mm[2]];
+        exchange.stylus = std::array::from_fn(|index| transform[index / 3 * 4 + index % 3]);
         exchange.buttons = buttons;
         exchange.came = Some(Instant::now());
         exchange.frames += 1;
-        if exchange.written.elapsed() > STILL { [0.0; 3] } else { exchange.force_n }
+        let is_still = exchange.written.elapsed() > STILL;
+        let torque_mn_m = exchange.torque_mn_m.map(|torque_mn_m| if is_still { [0.0; 3] } else { torque_mn_m });
+        (if is_still { [0.0; 3] } else { exchange.force_n }, torque_mn_m)
     };
     // SAFETY: as above.
     unsafe {
         (calls.set_numbers)(CURRENT_FORCE, force_n.as_ptr());
+        if let Some(torque_mn_m) = torque_mn_m {
+            (calls.set_numbers)(CURRENT_TORQUE, torque_mn_m.as_ptr());
+        }
         (calls.end)(*handle);
     }
     match calls.failure() {
@@ -249,6 +265,16 @@ pub(super) struct OpenHaptics {
     /// Middle of the workspace in the library's axes, mm.
     middle_mm: DVec3,
     buttons: u32,
+    orientation: DQuat,
+}
+
+/// Converts a vector of the library's axes to the device's, and back.
+fn of_device(library: DVec3) -> DVec3 {
+    DVec3::new(library.x, -library.z, library.y)
+}
+
+fn of_library(device: DVec3) -> [f64; 3] {
+    [device.x, device.z, -device.y]
 }
 
 impl OpenHaptics {
@@ -283,7 +309,9 @@ impl OpenHaptics {
         let exchange = Exchange {
             place_mm: [0.0; 3],
             buttons: 0,
+            stylus: [0.0; 9],
             force_n: [0.0; 3],
+            torque_mn_m: (descriptor.torque_n_m > 0.0).then_some([0.0; 3]),
             written: Instant::now(),
             came: None,
             frames: 0,
@@ -299,7 +327,7 @@ impl OpenHaptics {
             (calls.start)();
             task
         };
-        let device = OpenHaptics { shared, task, descriptor, middle_mm, buttons: 0 };
+        let device = OpenHaptics { shared, task, descriptor, middle_mm, buttons: 0, orientation: DQuat::IDENTITY };
         let begun = Instant::now();
         loop {
             let seen = device.shared.seen();
@@ -355,6 +383,7 @@ fn describe(calls: &OpenHapticsCalls) -> (Device, DVec3) {
         stiffness_n_per_m: told(MAX_STIFFNESS, 1e3, table.stiffness_n_per_m),
         damping_n_s_per_m: told(MAX_DAMPING, 1e3, table.damping_n_s_per_m),
         workspace_m: if reach_m.is_finite() && reach_m > 0.0 { reach_m } else { table.workspace_m },
+        torque_n_m: told(MAX_TORQUE, 1e-3, 0.0),
     };
     let middle_mm = 0.5 * (least_mm + most_mm);
     (descriptor, if middle_mm.is_finite() { middle_mm } else { DVec3::ZERO })
@@ -369,13 +398,28 @@ impl HapticDevice for OpenHaptics {
         let seen = self.shared.seen();
         self.alive(&seen, seen.came.unwrap_or_else(Instant::now), GONE)?;
         self.buttons = seen.buttons.unsigned_abs();
-        let DVec3 { x, y, z } = 1e-3 * (DVec3::from_array(seen.place_mm) - self.middle_mm);
-        Ok(Reading { place_m: DVec3::new(x, -z, y), enable: self.buttons & 1 != 0 })
+        let stylus = DMat3::from_cols_array(&seen.stylus) * STYLUS;
+        // A library that reports no transform leaves the stylus as it was.
+        if (stylus.determinant() - 1.0).abs() < 1e-3 {
+            let [x, y, z] = [stylus.x_axis, stylus.y_axis, stylus.z_axis].map(of_device);
+            self.orientation = DQuat::from_mat3(&DMat3::from_cols(x, y, z)).normalize();
+        }
+        let place_m = of_device(1e-3 * (DVec3::from_array(seen.place_mm) - self.middle_mm));
+        Ok(Reading { place_m, enable: self.buttons & 1 != 0 })
     }
 
     fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        self.write_wrench(Wrench::of_force(force_n))
+    }
+
+    fn orientation(&self) -> DQuat {
+        self.orientation
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> io::Result<()> {
         let mut exchange = self.shared.exchange();
-        exchange.force_n = [force_n.x, force_n.z, -force_n.y];
+        exchange.force_n = of_library(wrench.force_n);
+        exchange.torque_mn_m = exchange.torque_mn_m.map(|_| of_library(1e3 * wrench.torque_n_m));
         exchange.written = Instant::now();
         Ok(())
     }

@@ -10,7 +10,7 @@
 use std::time::Instant;
 
 use glam::{DQuat, DVec3, EulerRot};
-use palpate_haptics::Device;
+use palpate_haptics::{Device, Wrench};
 use palpate_refusal::{Reason, Refusal, Result, finite_vector, legible, number};
 
 use crate::bridge::Tick;
@@ -148,6 +148,22 @@ impl<D: HapticDevice> Placed<D> {
         &self.device
     }
 
+    /// Returns the wrench of the tool as that of the device. The powers of force and torque have the same ratio on both sides, so that
+    /// what is passive stays so: ways are scaled, turns are not.
+    fn pass(&mut self, wrench: Wrench) -> Wrench {
+        if self.held_m.is_none() && wrench.force_n.length() < ENGAGED_N {
+            self.is_shut = false;
+        }
+        if self.is_shut {
+            return Wrench::default();
+        }
+        let (Placement { scale, force_scale, .. }, back) = (self.placement, self.rotation.inverse());
+        Wrench {
+            force_n: force_scale * (back * wrench.force_n),
+            torque_n_m: force_scale / scale * (back * wrench.torque_n_m),
+        }
+    }
+
     fn asks(&mut self, reading: Reading, buttons: u32) -> bool {
         match self.placement.enable {
             Enables::Device => reading.enable,
@@ -170,6 +186,7 @@ impl<D: HapticDevice> HapticDevice for Placed<D> {
             stiffness_n_per_m: device.stiffness_n_per_m / (scale * force_scale),
             damping_n_s_per_m: device.damping_n_s_per_m / (scale * force_scale),
             workspace_m: scale * device.workspace_m + offset_m.length() + shift_m,
+            torque_n_m: device.torque_n_m * scale / force_scale,
             ..device
         }
     }
@@ -197,12 +214,21 @@ impl<D: HapticDevice> HapticDevice for Placed<D> {
     }
 
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
-        if self.held_m.is_none() && force_n.length() < ENGAGED_N {
-            self.is_shut = false;
-        }
-        let passed_n =
-            if self.is_shut { DVec3::ZERO } else { self.placement.force_scale * (self.rotation.inverse() * force_n) };
-        self.device.write(passed_n)
+        let passed = self.pass(Wrench::of_force(force_n));
+        self.device.write(passed.force_n)
+    }
+
+    fn orientation(&self) -> DQuat {
+        self.rotation * self.device.orientation()
+    }
+
+    fn jaw_rad(&self) -> f64 {
+        self.device.jaw_rad()
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> std::io::Result<()> {
+        let passed = self.pass(wrench);
+        self.device.write_wrench(passed)
     }
 
     fn buttons(&self) -> u32 {

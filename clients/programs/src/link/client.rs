@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_haptics::envelope::{Envelope, Wanted};
-use palpate_haptics::{Law, LocalModel, MotionState, OtherTool, Predicted, Prediction, Predictor, Renderer, Tip};
+use palpate_haptics::{
+    InstrumentPose, Law, LocalModel, MotionState, OtherTool, Predicted, Prediction, Predictor, Renderer, Tip, Wrench,
+};
 use palpate_session::tissue_copy::TissueCopy;
 use palpate_tissue::Model;
 
@@ -28,7 +30,7 @@ struct Copied {
 }
 
 impl Predictor for Copied {
-    fn feel(&mut self, now_s: f64, place_m: DVec3, others: &[OtherTool]) -> Option<Predicted> {
+    fn feel(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted> {
         self.others.clear();
         self.others.extend(others.iter().map(|other| {
             let MotionState { time_s, place_m, velocity_m_per_s } = other.motion;
@@ -36,8 +38,8 @@ impl Predictor for Copied {
                 (self.spot.of_tissue(place_m), self.spot.direction_of_tissue(velocity_m_per_s));
             OtherTool { motion: MotionState { time_s, place_m, velocity_m_per_s }, ..*other }
         }));
-        let felt = self.tissue.feel(now_s, self.spot.of_tissue(place_m), &self.others)?;
-        Some(Predicted { force_n: self.spot.direction(felt.force_n), ..felt })
+        let felt = self.tissue.feel(now_s, &InstrumentPose::at(self.spot.of_tissue(pose.place_m)), &self.others)?;
+        Some(Predicted { wrench: Wrench::of_force(self.spot.direction(felt.wrench.force_n)), ..felt })
     }
 }
 

@@ -20,6 +20,11 @@ const MIN_FORCE_N: f64 = 1e-6;
 /// Time after the end of an outage for which its effect on the force may last, s.
 const RECOVERS_S: f64 = 0.05;
 
+/// Returns how often each limit of an envelope has acted.
+pub(super) fn interventions(envelope: &Envelope) -> Vec<(&'static str, u64)> {
+    LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect()
+}
+
 /// The outcome of a run. A tick is in contact if the twin touches or a force is rendered; figures without another
 /// word are over these ticks.
 #[derive(Debug, Clone, Default)]
@@ -220,8 +225,7 @@ impl Totals {
         let (acted, _) = envelope.count(LimitCause::Passivity);
         // Passivity acts on a force, which exists only in contact.
         self.outcome.guard_share = acted as f64 / self.errors_n.len().max(1) as f64;
-        self.outcome.interventions =
-            LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+        self.outcome.interventions = interventions(envelope);
     }
 
     /// Computes the outcome from the sums.

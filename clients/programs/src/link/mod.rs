@@ -5,6 +5,8 @@ mod boundary;
 mod client;
 mod direct;
 mod figures;
+mod instrument;
+mod instrument_runs;
 mod laws;
 mod live;
 mod measure;
@@ -37,6 +39,7 @@ use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
 use crate::table;
 use figures::{figures, rows};
+use instrument::InstrumentKind;
 use laws::PlaceLaws;
 use run::run;
 use setup::{Rendering, SecondHand, Setup, TissueChange};
@@ -51,9 +54,13 @@ pub(crate) struct LinkArguments {
     /// The hand that holds the device: light, medium or firm; or none: a weak string leads the device
     #[arg(long, default_value = "medium")]
     hand: String,
-    /// The device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7 or inverse3; or undeclared
-    #[arg(long, default_value = "omega3")]
-    device: String,
+    /// The device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7 or inverse3; or undeclared. Of these sigma7 and
+    /// lambda7 render torque [default: omega3; with --instrument sigma7]
+    #[arg(long)]
+    device: Option<String>,
+    /// The hand leads an instrument by a device of six axes, which renders force and torque from a copy of the tissue
+    #[arg(long, value_name = "KIND", conflicts_with_all = ["second_tool_mm", "tissue_change_s", "stall_ms", "scheme", "deadband", "up_deadband", "course", "server", "boundary"])]
+    instrument: Option<InstrumentKind>,
     /// Round-trip time, ms
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     rtt_ms: Option<f64>,
@@ -184,10 +191,13 @@ pub(crate) async fn link(arguments: &LinkArguments) -> Result<(), ClientFailure>
     if arguments.boundary {
         return boundary::print(arguments.json);
     }
-    if let Some(runs) = arguments.random {
+    if let (Some(runs), None) = (arguments.random, arguments.instrument) {
         return random::print(arguments, runs);
     }
     let setup = memory::attempt("--scene", || setup(arguments))?;
+    if let Some(kind) = arguments.instrument {
+        return instrument_runs::print(arguments, &setup, kind);
+    }
     let outcome = match &arguments.server {
         Some(server) => live::run(&setup, arguments.credentials.server(server)?).await?,
         None => with_tissue(|| run(&setup))?,
@@ -218,7 +228,8 @@ fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, ClientF
 fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let limits = Limits::default();
     let hand = hand_named(&arguments.hand)?;
-    let device = device_named(&arguments.device)?;
+    let usual = if arguments.instrument.is_some() { "sigma7" } else { "omega3" };
+    let device = device_named(arguments.device.as_deref().unwrap_or(usual))?;
     let conditions = match arguments.profile {
         Some(profile) => profile.conditions(),
         None => {

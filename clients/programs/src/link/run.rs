@@ -107,8 +107,11 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
             &LinkTick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s },
             client.envelope().map(|envelope| &*envelope),
         );
-        if let Some(envelope) = client.envelope().filter(|_| !is_stalled) {
-            operate(envelope, now_s, &mut paused_s, &mut totals.outcome);
+        if let Some(envelope) = client.envelope().filter(|_| !is_stalled)
+            && let Some(state) = operate(envelope, now_s, &mut paused_s)
+        {
+            totals.outcome.pauses += 1;
+            totals.outcome.faults += u64::from(state == RenderingState::Fault);
         }
         let (from_m, to_m) = (task.at(now_s), task.at(now_s + TICK_S));
         let string_n = hand.string_n(from_m, place_m);
@@ -145,16 +148,14 @@ fn serve(server: &mut LinkServer, network: &mut LinkNetwork, now_s: f64) -> Resu
     Ok(bytes)
 }
 
-/// Enables rendering again, as the simulated operator, [`PAUSE_S`] after it has paused.
-fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outcome: &mut LinkOutcome) {
+/// Enables rendering again, as the simulated operator, [`PAUSE_S`] after it has paused. Returns the state in which it has paused in
+/// this tick, if it has.
+pub(super) fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>) -> Option<RenderingState> {
     match (envelope.state(), *paused_s) {
         (RenderingState::Enabled, _) => *paused_s = None,
-        (_, None) => {
+        (state, None) => {
             *paused_s = Some(now_s);
-            outcome.pauses += 1;
-            if envelope.state() == RenderingState::Fault {
-                outcome.faults += 1;
-            }
+            return Some(state);
         }
         (_, Some(since_s)) if now_s - since_s > PAUSE_S => {
             envelope.reset();
@@ -162,4 +163,5 @@ fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outc
         }
         _ => {}
     }
+    None
 }

@@ -6,7 +6,7 @@ use std::io::Cursor;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use palpate_haptics::{Predictor, Tip};
+use palpate_haptics::{Instrument, Predictor};
 use palpate_proto::journal as pb;
 
 use super::inputs;
@@ -579,13 +579,13 @@ pub fn resume(reader: JournalReader<'_>, limits: &Limits) -> Result<Resumed> {
 }
 
 /// Returns a copy of the tissue in an encoded journal with at least one snapshot (the last counts), at rest, for a
-/// client's tool with the tip `tip`. It can be stepped at 1 kHz. The session's steps and tools are not restored.
+/// client's `instrument`, which may be a single tip. It can be stepped at 1 kHz. The session's steps and tools are not restored.
 ///
 /// # Errors
 /// Returns a message if the bytes are no such journal or of another generation, if the tissue has more than 100,000
-/// points or is invalid, if the tip does not fit the tissue or is too large ([`TissueCopy::for_client`]), or if
+/// points or is invalid, if a tip does not fit the tissue or is too large ([`TissueCopy::for_client`]), or if
 /// memory is missing.
-pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
+pub fn prediction(bytes: &[u8], instrument: &Instrument) -> std::result::Result<Box<dyn Predictor>, String> {
     #[allow(clippy::cast_possible_truncation)]
     let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
     let copy = || {
@@ -597,7 +597,7 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
         let first = message::model(reader.header(), &limits)?;
         let (_, snapshot, _) = snapshot(&mut reader, at)?;
         let (_, model) = saved(&snapshot, &first, &limits)?;
-        TissueCopy::for_client(&model, tip)
+        TissueCopy::for_client(&model, instrument)
     };
     let copy = memory::attempt("snapshot", copy).map_err(|refusal| refusal.to_string())?;
     Ok(Box::new(copy))

@@ -542,28 +542,16 @@ impl Binding<'_> {
                 Ok(InstrumentTip { offset_m, tip: read(fields)?, part: InstrumentPart::Body })
             })?);
         }
-        let mut from_m = DVec3::ZERO;
-        if let Some(jaws) = fields.item("jaws") {
-            let (length_m, tip) = jaws.table(|fields| {
+        let mut part = |key: &'static str| {
+            let Some(part) = fields.item(key) else { return Ok(None) };
+            let of_part = part.table(|fields| {
                 let length_m = positive(&fields.path("length_m"), fields.required_number("length_m")?)?;
                 Ok((length_m, read(fields)?))
-            })?;
-            instrument.hinge_m = -length_m * DVec3::X;
-            from_m = instrument.hinge_m;
-            // Closed jaws touch each other.
-            let begin_m = from_m + (2.0 * tip.radius_m).min(length_m) * DVec3::X;
-            for (part, side) in [(InstrumentPart::UpperJaw, 1.0), (InstrumentPart::LowerJaw, -1.0)] {
-                let beside_m = if tip.shape == TipShape::Sphere { side * tip.radius_m * DVec3::Y } else { DVec3::ZERO };
-                instrument.add_row(begin_m + beside_m, beside_m, tip, part);
-            }
-        }
-        if let Some(shaft) = fields.item("shaft") {
-            let (length_m, tip) = shaft.table(|fields| {
-                let length_m = positive(&fields.path("length_m"), fields.required_number("length_m")?)?;
-                Ok((length_m, read(fields)?))
-            })?;
-            instrument.add_row(from_m, from_m - length_m * DVec3::X, tip, InstrumentPart::Body);
-        }
+            });
+            of_part.map(Some)
+        };
+        let (jaws, shaft) = (part("jaws")?, part("shaft")?);
+        instrument.add_parts(jaws, shaft);
         if instrument.tips.is_empty() {
             return Err(item.refuse(Reason::Missing, "must have `tips`, a `shaft` or `jaws`"));
         }
