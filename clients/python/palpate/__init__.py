@@ -17,6 +17,7 @@ from ._errors import Disconnected, Error, Failed, Refused
 from ._journal import Commands, Verdict
 from ._native import (
     Frames,
+    Instrument,
     Journal,
     Offline,
     RemoteSession,
@@ -46,6 +47,7 @@ __all__ = [
     "Failed",
     "Frame",
     "Frames",
+    "Instrument",
     "Journal",
     "Offline",
     "Refused",

@@ -153,6 +153,25 @@ class Tip:
     def grasps(self) -> bool:
         """Whether the tip holds the tissue under it instead of touching it."""
 
+class Instrument:
+    """An instrument that a device leads by its place and orientation: jaws that end at its place, and a shaft behind them, each
+    a row of tips of a length. It points along x of its frame; the jaws open in y. With `port_m` the shaft slides through that
+    place, as through a trocar, and the handle is `handle_m` from the place. Raises Refused if it has neither jaws nor a
+    shaft."""
+
+    def __init__(
+        self,
+        *,
+        jaws_m: Optional[float] = None,
+        shaft_m: Optional[float] = None,
+        tip: Optional[Tip] = None,
+        port_m: Optional[Vector] = None,
+        handle_m: float = 0.33,
+    ) -> None: ...
+    @property
+    def tips(self) -> int:
+        """The number of tips: each is a tool of the session."""
+
 class Session:
     """A simulated tissue. A tool's command acts from the next step on, until its next command. Several threads may use one
     session; the interpreter's lock is released while it steps."""
@@ -359,6 +378,7 @@ class RemoteSession:
         prediction: Literal["auto", "always", "never"] = "auto",
         holder: str = "python",
         remember: bool = True,
+        instrument: Optional[Instrument] = None,
     ) -> Touched:
         """Touches with a device at 1 kHz, on a thread of its own, with rendered forces within the safety envelope.
 
@@ -367,6 +387,10 @@ class RemoteSession:
         which tissues the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes;
         "always"; "never". Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason TOOL_HELD, if somebody
         holds the tool, this session object included.
+
+        With `instrument` the device leads it, and its tips are the tools from `tool` on: `read()` also returns the
+        orientation (w, x, y, z) of the device and the angle between the jaws, rad, and `write(force_n, torque_n_m)` gets the
+        torque about the device's place, within `torque_n_m` of `limits`. Force and torque come from a copy of the tissue.
         """
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
         """Moves a tool with a tip to `place_m` by the end of the next step; acquires the tool first if needed. It stays there

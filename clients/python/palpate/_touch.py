@@ -22,7 +22,7 @@ class Course:
     """A device that moves along `places_m`, one row per millisecond, measured from the top of the tissue (`Tissue.top_m`), z up.
 
     `limits` is the name of a device (`palpate.devices()`), or a dict with force_n, continuous_n, stiffness_n_per_m,
-    damping_n_s_per_m, workspace_m.
+    damping_n_s_per_m, workspace_m, torque_n_m.
     """
 
     places_m: np.ndarray
@@ -50,7 +50,7 @@ class Touched:
     force on the hand that the device was given, z up. `time_s` is counted from the first tick; `enabled` says whether forces were
     enabled. `ages_s` is the age of the newest data of the tissue, for ticks since the first data. `limits` counts the ticks in which
     each limit of the safety envelope acted, `energy_j` is the energy that the device gave to the hand, and `lost` is the reason why
-    there was no connection at the end, or None.
+    there was no connection at the end, or None. `largest_torque_n_m` is 0 without an instrument.
     """
 
     time_s: np.ndarray
@@ -71,6 +71,7 @@ class Touched:
     limits: dict
     energy_j: float
     lost: Optional[str]
+    largest_torque_n_m: float = 0.0
 
 
 @dataclasses.dataclass(eq=False)

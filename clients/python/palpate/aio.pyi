@@ -2,7 +2,7 @@ from collections.abc import AsyncIterator
 from os import PathLike
 from typing import Any, Literal, Optional, Union
 
-from . import Frame, Point, Run, Sampled, Scene, Script, Source, Tip, Touched, Vector
+from . import Frame, Instrument, Point, Run, Sampled, Scene, Script, Source, Tip, Touched, Vector
 
 class Samples(AsyncIterator[dict[str, Any]]):
     async def take(self, count: int) -> Sampled: ...
@@ -47,6 +47,7 @@ class RemoteSession:
         prediction: Literal["auto", "always", "never"] = "auto",
         holder: str = "python",
         remember: bool = True,
+        instrument: Optional[Instrument] = None,
     ) -> Touched: ...
     async def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None: ...
     async def push(

@@ -23,6 +23,7 @@ use crate::arrays::vector;
 use crate::device::Given;
 use crate::error::{of_client, of_status, refused, wrong};
 use crate::held::Held;
+use crate::instrument::Instrument;
 use crate::load::load;
 use crate::play::play;
 use crate::scene::{Scene, Script, point_name};
@@ -384,8 +385,13 @@ impl RemoteSession {
     /// says of which tissues the loop simulates a copy, so that forces come without the delay of the network: "auto",
     /// of meshes; "always"; "never". Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason
     /// TOOL_HELD, if somebody holds the tool, this session object included.
+    ///
+    /// With `instrument` the device leads it, and its tips are the tools from `tool` on: `read()` also returns the
+    /// orientation (w, x, y, z) of the device and the angle between the jaws, rad, and `write(force_n, torque_n_m)` gets
+    /// the torque about the device's place, within `torque_n_m` of `limits`. Force and torque come from a copy of the
+    /// tissue.
     #[pyo3(signature = (device, *, seconds=None, tool=0, tip=None, deadband=0.0, up_deadband=0.0, datagrams=true,
-        prediction="auto", holder="python", remember=true))]
+        prediction="auto", holder="python", remember=true, instrument=None))]
     #[allow(clippy::too_many_arguments)]
     fn touch<'py>(
         &self,
@@ -400,10 +406,12 @@ impl RemoteSession {
         prediction: &str,
         holder: &str,
         remember: bool,
+        instrument: Option<Instrument>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let of_grids = match prediction {
             "always" => Some(true),
-            "auto" => Some(false),
+            // An instrument is rendered from a copy of any tissue.
+            "auto" => Some(instrument.is_some()),
             "never" => None,
             _ => {
                 let message = format!("must be \"auto\", \"always\" or \"never\", but is {prediction:?}");
@@ -411,7 +419,9 @@ impl RemoteSession {
             }
         };
         let copies = of_grids.map(|of_grids| Copies { make: Arc::new(journal::prediction), of_grids });
-        let device = Given::of(device)?;
+        let device = Given::of(device, instrument.is_some())?;
+        let instrument = instrument.map(|instrument| instrument.0);
+        let tools = tool..tool.saturating_add(instrument.as_ref().map_or(1, |instrument| instrument.tips.len() as u32));
         let lasts = seconds.or(device.lasts_s()).map(|seconds| duration("seconds", seconds)).transpose()?;
         let target = Target {
             server: self.session.server(),
@@ -423,7 +433,8 @@ impl RemoteSession {
             datagrams,
             holder: holder.to_owned(),
         };
-        let options = Options { lasts, remembers: remember, keeps_session: true, copies, ..Options::default() };
+        let options =
+            Options { lasts, remembers: remember, keeps_session: true, copies, instrument, ..Options::default() };
         let (end, ended) = oneshot::channel();
         let held = self.held.clone();
         answer_in_order(py, self.awaited, Some(end), async move {
@@ -431,7 +442,10 @@ impl RemoteSession {
                 // Dropped when the caller no longer waits.
                 let _ = ended.await;
             };
-            if held.holds(tool).await {
+            for tool in tools {
+                if !held.holds(tool).await {
+                    continue;
+                }
                 let message = format!(
                     "tool {tool} is held by this session object, which took it for pose, push or grasp: call release({tool}) \
                      first, or touch with another tool"

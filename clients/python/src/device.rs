@@ -3,10 +3,11 @@
 use std::io::{Error, ErrorKind, Result};
 use std::time::Instant;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use palpate_client::{HapticDevice, Reading};
-use palpate_haptics::Device;
 use palpate_haptics::device::{DEVICES, UNDECLARED};
+use palpate_haptics::instrument_pose::MAX_JAW_RAD;
+use palpate_haptics::{Device, Wrench};
 use palpate_refusal::did_you_mean;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -35,8 +36,16 @@ pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
                 "stiffness_n_per_m" => device.stiffness_n_per_m = number,
                 "damping_n_s_per_m" => device.damping_n_s_per_m = number,
                 "workspace_m" => device.workspace_m = number,
+                "torque_n_m" => device.torque_n_m = number,
                 _ => {
-                    let keys = ["force_n", "continuous_n", "stiffness_n_per_m", "damping_n_s_per_m", "workspace_m"];
+                    let keys = [
+                        "force_n",
+                        "continuous_n",
+                        "stiffness_n_per_m",
+                        "damping_n_s_per_m",
+                        "workspace_m",
+                        "torque_n_m",
+                    ];
                     let message = format!("`{key}` is not one of {}{}", keys.join(", "), did_you_mean(&key, keys));
                     return Err(wrong("limits", message));
                 }
@@ -57,8 +66,9 @@ pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
 
 /// A device given by Python.
 pub(crate) enum Given {
-    /// An object with `read()` and `write(force_n)`.
-    Object { device: Device, read: Py<PyAny>, write: Py<PyAny> },
+    /// An object with `read()` and `write(force_n)`, or, if it leads an instrument, `write(force_n, torque_n_m)`. Then it has an
+    /// orientation and an angle of the jaws, rad, at the newest reading.
+    Object { device: Device, read: Py<PyAny>, write: Py<PyAny>, handle: Option<(DQuat, f64)> },
     /// A course: a place for each millisecond.
     Course { device: Device, places_m: Vec<DVec3>, begun: Option<Instant> },
 }
@@ -70,8 +80,8 @@ const ASKS_EVERY_S: f64 = 0.3;
 const RATE_HZ: f64 = 1000.0;
 
 impl Given {
-    /// Reads an object or a `palpate.Course`.
-    pub(crate) fn of(value: &Bound<'_, PyAny>) -> PyResult<Self> {
+    /// Reads an object or a `palpate.Course`, which does not turn.
+    pub(crate) fn of(value: &Bound<'_, PyAny>, leads_instrument: bool) -> PyResult<Self> {
         let device = descriptor(value.getattr_opt("limits")?)?;
         if let Some(places_m) = value.getattr_opt("places_m")? {
             let places_m: Vec<[f64; 3]> =
@@ -88,7 +98,8 @@ impl Given {
                 .map(Bound::unbind)
                 .ok_or_else(|| wrong("device", format!("has no method `{name}`: it needs read() and write(force_n)")))
         };
-        Ok(Given::Object { device, read: method("read")?, write: method("write")? })
+        let handle = leads_instrument.then_some((DQuat::IDENTITY, 0.0));
+        Ok(Given::Object { device, read: method("read")?, write: method("write")?, handle })
     }
 
     /// Returns how long the course lasts, s; `None` for an object.
@@ -116,6 +127,20 @@ impl HapticDevice for Given {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn read(&mut self) -> Result<Reading> {
         match self {
+            Given::Object { read, handle: Some(handle), .. } => attached(|py| {
+                let told: ([f64; 3], bool, [f64; 4], f64) = read.bind(py).call0()?.extract().map_err(|_| {
+                    let text = "read() must return place, whether forces are asked for, orientation and jaw angle: \
+                                ((x, y, z), True, (w, x, y, z), 0.5)";
+                    wrong("device", text)
+                })?;
+                let (place_m, enable, [w, x, y, z], jaw_rad) = told;
+                let orientation = DQuat::from_xyzw(x, y, z, w);
+                if (orientation.length() - 1.0).abs() > 1e-3 {
+                    return Err(wrong("device", "read() returned an orientation whose length is not 1"));
+                }
+                *handle = (orientation.normalize(), jaw_rad.clamp(0.0, MAX_JAW_RAD));
+                Ok(Reading { place_m: DVec3::from_array(place_m), enable })
+            }),
             Given::Object { read, .. } => attached(|py| {
                 let (place_m, enable): ([f64; 3], bool) = read.bind(py).call0()?.extract().map_err(|_| {
                     wrong("device", "read() must return a place and whether forces are asked for: ((x, y, z), True)")
@@ -129,6 +154,30 @@ impl HapticDevice for Given {
                 let place_m = place_m.ok_or(ErrorKind::InvalidInput)?;
                 Ok(Reading { place_m, enable: now_s % ASKS_EVERY_S < ASKS_EVERY_S / 2.0 })
             }
+        }
+    }
+
+    fn orientation(&self) -> DQuat {
+        match self {
+            Given::Object { handle: Some((orientation, _)), .. } => *orientation,
+            _ => DQuat::IDENTITY,
+        }
+    }
+
+    fn jaw_rad(&self) -> f64 {
+        match self {
+            Given::Object { handle: Some((_, jaw_rad)), .. } => *jaw_rad,
+            _ => 0.0,
+        }
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> Result<()> {
+        match self {
+            Given::Object { write, .. } => {
+                let [force, torque] = [wrench.force_n, wrench.torque_n_m].map(<(f64, f64, f64)>::from);
+                attached(|py| write.bind(py).call1((force, torque)).map(drop))
+            }
+            Given::Course { .. } => Ok(()),
         }
     }
 

@@ -16,6 +16,7 @@ mod device;
 mod ending;
 mod error;
 mod held;
+mod instrument;
 mod journal;
 mod load;
 mod offline;
@@ -40,6 +41,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<scene::Tissue>()?;
     module.add_class::<session::Session>()?;
     module.add_class::<tip::Tip>()?;
+    module.add_class::<instrument::Instrument>()?;
     module.add_class::<journal::Journal>()?;
     module.add_class::<client::Server>()?;
     module.add_class::<client::RemoteSession>()?;

@@ -123,8 +123,18 @@ impl<'py> IntoPyObject<'py> for Touched {
             let text = std::ffi::CString::new(why)?;
             PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 1)?;
         }
-        let BridgeReport { course, ages_s, envelope, late_ticks, missed_ticks, predicted_ticks, traffic, lost, .. } =
-            self.0;
+        let BridgeReport {
+            course,
+            ages_s,
+            envelope,
+            late_ticks,
+            missed_ticks,
+            predicted_ticks,
+            most_torque_n_m,
+            traffic,
+            lost,
+            ..
+        } = self.0;
         let found = PyDict::new(py);
         let place_m = course.iter().flat_map(|tick| tick.place_m.to_array()).collect();
         let force_n = course.iter().flat_map(|tick| tick.force_n.to_array()).collect();
@@ -152,6 +162,7 @@ impl<'py> IntoPyObject<'py> for Touched {
         found.set_item("limits", limits)?;
         found.set_item("energy_j", envelope.as_ref().map_or(0.0, palpate_haptics::Envelope::energy_j))?;
         found.set_item("lost", lost.map(|error| error.to_string()))?;
+        found.set_item("largest_torque_n_m", most_torque_n_m)?;
         py.import("palpate._touch")?.getattr("Touched")?.call((), Some(&found))
     }
 }

@@ -35,6 +35,24 @@ class Hand:
         self.forces.append(force_n)
 
 
+class Handle(Hand):
+    """A device of six axes, whose instrument lies along x and presses 2 mm deep."""
+
+    limits = "sigma7"
+
+    def __init__(self, orientation=(1.0, 0.0, 0.0, 0.0)):
+        super().__init__()
+        self.orientation, self.torques = orientation, []
+
+    def read(self):
+        place_m, enable = super().read()
+        return place_m, enable, self.orientation, 0.2
+
+    def write(self, force_n, torque_n_m):
+        super().write(force_n)
+        self.torques.append(torque_n_m)
+
+
 # Ends while samples come that are no longer awaited.
 ENDING = """
 import asyncio, sys
@@ -193,6 +211,28 @@ class Clients(Served, unittest.TestCase):
         self.assertEqual(len(hand.threads), 1)
         self.assertNotEqual(hand.threads, {threading.get_ident()})
         self.assertEqual(len(touched.time_s), 0)
+
+    def test_a_device_of_six_axes_feels_force_and_torque_on_an_instrument(self):
+        instrument = palpate.Instrument(jaws_m=0.01, shaft_m=0.012, tip=palpate.Tip(0.004))
+        self.assertGreater(instrument.tips, 6)
+        with palpate.connect(self.url).create_session("liver") as session:
+            for _ in range(20):
+                handle = Handle()
+                touched = session.touch(handle, seconds=2.0, instrument=instrument)
+                if touched.largest_torque_n_m > 1e-3:
+                    break
+            # What presses the shaft, which lies along -x of the tip, up, turns it about y.
+            most = max(handle.torques, key=lambda torque: abs(torque[1]))
+            self.assertGreater(most[1], 1e-3)
+            self.assertGreater(max(force[2] for force in handle.forces), 0.05)
+            self.assertEqual((handle.forces[-1], handle.torques[-1]), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+            self.assertEqual(touched.refused, 0)
+            self.assertGreater(touched.predicted_ticks, 0)
+            with self.assertRaisesRegex(palpate.Refused, "length is not 1"):
+                session.touch(Handle((2.0, 0.0, 0.0, 0.0)), seconds=1.0, instrument=instrument)
+        for wrong, names in [({}, "jaws"), ({"jaws_m": -1.0}, "jaws_m"), ({"shaft_m": 0.9}, "tips"), ({"shaft_m": 0.01, "handle_m": 9.0}, "handle_m")]:
+            with self.assertRaisesRegex(palpate.Refused, names):
+                palpate.Instrument(**wrong)
 
     def test_an_exception_of_a_device_comes_back_as_itself(self):
         hand = Hand(fails_at=200)
