@@ -641,7 +641,7 @@ pub struct PosesDatagram {
     /// or 0: as requested when the stream was opened. At least 0.01.
     #[prost(float, tag = "3")]
     pub heartbeat_s: f32,
-    /// For each tool the poses that may not have arrived. Empty: a heartbeat.
+    /// For each tool the poses that may not have arrived. A datagram without poses is a heartbeat.
     #[prost(message, repeated, tag = "4")]
     pub tools: ::prost::alloc::vec::Vec<ToolPoses>,
     /// Time of the client's own clock, of any origin, when this was sent.

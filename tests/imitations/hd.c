@@ -116,6 +116,9 @@ void hdGetDoublev(unsigned int name, double *to) {
 
 void hdGetIntegerv(unsigned int name, int *to) {
   if (name == 0x2000) *to = tick % 300 < 150;
+#ifdef SIX_AXES
+  else if (name == 0x2554) *to = 6;
+#endif
   else fail(0x0100);
 }
 

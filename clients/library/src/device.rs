@@ -55,6 +55,7 @@ pub struct Reading {
 ///             stiffness_n_per_m: 700.0,
 ///             damping_n_s_per_m: 5.0,
 ///             workspace_m: 0.1,
+///             torque_n_m: 0.0,
 ///         }
 ///     }
 ///

@@ -9,8 +9,8 @@ use palpate_client::devices::{self, DeviceKind, Placed, Placement};
 use palpate_haptics::instrument::MAX_TIPS;
 use palpate_haptics::port::HANDLE_M;
 use palpate_haptics::{Instrument, LimitCause, Port, RenderingState, Tip, TipShape};
-use palpate_refusal::number;
 use palpate_refusal::printable::printable_json;
+use palpate_refusal::{finite_vector, number};
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
 use serde_json::json;
@@ -127,6 +127,11 @@ fn instrument(arguments: &BridgeArguments, tip: Tip) -> Result<Option<Instrument
     }
     number("--radius-m", tip.radius_m, "above 0", |m| m > 0.0)?;
     let range = format!("from {} to {}", HANDLE_M.start(), HANDLE_M.end());
+    arguments.port_m.map_or(Ok(DVec3::ZERO), |place_m| finite_vector("--port-m", place_m))?;
+    if arguments.prediction == When::Never {
+        let text = "--prediction: an instrument is rendered from a copy of the tissue: choose auto or always";
+        return Err(ClientFailure::Refused(text.to_owned()));
+    }
     let handle_m = number("--handle-m", arguments.handle_m, &range, |m| HANDLE_M.contains(&m))?;
     let mut instrument = Instrument::default();
     instrument.add_parts(jaws_m.map(|length_m| (length_m, tip)), shaft_m.map(|length_m| (length_m, tip)));
@@ -268,10 +273,12 @@ fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
         ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
         ("lateness of ticks p50 / p99 / max", format!("{p50_us:.0} / {p99_us:.0} / {max_us:.0} µs")),
         ("largest force", table::with_unit(served.most_force_n, "N")),
-        ("largest torque", table::with_unit(served.most_torque_n_m, "N·m")),
         ("tissue moved at most", format!("{:.1} mm", 1e3 * deepest_m)),
         ("from a copy of the tissue", format!("{} ticks", served.predicted_ticks)),
     ];
+    if served.most_torque_n_m > 0.0 {
+        rows.push(("largest torque", table::with_unit(served.most_torque_n_m, "N·m")));
+    }
     if let Some(envelope) = &served.envelope {
         let is_on = envelope.state() == RenderingState::Enabled;
         rows.push(("energy into the device", table::with_unit(envelope.energy_j(), "J")));

@@ -43,7 +43,7 @@ impl InstrumentPose {
     #[must_use]
     pub fn towards(&self, other: &Self, part: f64) -> Self {
         InstrumentPose {
-            place_m: self.place_m + (other.place_m - self.place_m) * part,
+            place_m: self.place_m.lerp(other.place_m, part),
             orientation: turned_towards(self.orientation, other.orientation, part),
             jaw_rad: self.jaw_rad + (other.jaw_rad - self.jaw_rad) * part,
         }

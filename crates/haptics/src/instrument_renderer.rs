@@ -7,11 +7,15 @@
 //! sample changes e; that difference is kept as a bias and decays with [`BIAS_S`]. If poses were late, a server has the instrument
 //! elsewhere at t₀ than the client had it. Such a sample tells of another place and leaves e as it is.
 //!
-//! While there is no copy, or it has no answer, the last wrench is kept: the envelope counts the time since the last answer as the
-//! age of the model, so the wrench fades and rendering pauses.
+//! While there is no copy, or it has no answer, the last wrench is kept: the envelope counts the time since the last wrench of the
+//! copy as the age of the model, so the wrench fades and rendering pauses.
+//!
+//! **Port.** An instrument in a port follows the place of the device and its turn about the shaft ([`crate::port`]). The device gets
+//! the wrench with the same power for each of its own movements ([`Port::on_device`]), and the envelope counts these.
 
 use crate::envelope::{Envelope, RenderingState, Wanted, WantedTurn};
 use crate::instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
+use crate::port::Port;
 use crate::prediction::{MAX_OTHERS, OtherTool, Prediction, replace_others};
 use crate::renderer::BIAS_S;
 use glam::DVec3;
@@ -51,12 +55,13 @@ impl WrenchSample {
 #[derive(Debug)]
 pub struct InstrumentRenderer {
     prediction: Option<Prediction>,
+    port: Option<Port>,
     others: Vec<OtherTool>,
     /// The newest sample in use, one that waits for the next tick with its arrival, s, and the arrival of the newest, s.
     newest: Option<WrenchSample>,
     arrived: Option<(WrenchSample, f64)>,
     newest_s: Option<f64>,
-    /// Time of the copy's last answer, s.
+    /// Time of the last wrench of the copy, s.
     answered_s: Option<f64>,
     bias: Wrench,
     biased_s: f64,
@@ -72,10 +77,11 @@ pub struct InstrumentRenderer {
 
 impl InstrumentRenderer {
     /// Creates a renderer without a copy, which renders nothing until it has one ([`InstrumentRenderer::predict`]) and a sample has
-    /// been compared with it. The wrench passes through `envelope`.
-    pub fn new(envelope: Envelope) -> Self {
+    /// been compared with it. `port`: that of the instrument. The wrench passes through `envelope`.
+    pub fn new(envelope: Envelope, port: Option<Port>) -> Self {
         InstrumentRenderer {
             prediction: None,
+            port,
             others: Vec::with_capacity(MAX_OTHERS),
             newest: None,
             arrived: None,
@@ -120,9 +126,9 @@ impl InstrumentRenderer {
         self.arrived = Some((sample, now_s));
     }
 
-    /// Advances by one tick: moves the instrument in the copy to its `pose`, in the tissue's frame, at `now_s` by the client's clock,
-    /// s. Does not allocate. A value that is not finite makes the envelope's state FAULT. Returns the wrench to render until the next
-    /// tick, about the place of the pose.
+    /// Advances by one tick: moves the instrument in the copy to where a device leads it that is at a `pose`, in the tissue's frame, at
+    /// `now_s` by the client's clock, s. Does not allocate. A value that is not finite makes the envelope's state FAULT. Returns the
+    /// wrench to render on the device until the next tick, about the place of the pose.
     pub fn tick(&mut self, now_s: f64, pose: &InstrumentPose) -> Wrench {
         let is_known = pose.is_finite() && now_s.is_finite();
         let mut turned_rad = DVec3::ZERO;
@@ -137,10 +143,8 @@ impl InstrumentRenderer {
         if is_known {
             self.before = Some((now_s, *pose));
             if let Some(prediction) = &mut self.prediction {
-                self.envelope.supply(prediction.move_to(now_s, pose, &self.others));
-                if prediction.has_answer() {
-                    self.answered_s = Some(now_s);
-                }
+                let led = self.port.map_or(*pose, |port| port.lead(pose));
+                self.envelope.supply(prediction.move_to(now_s, &led, &self.others));
             }
             if let Some((sample, arrived_s)) = self.arrived.take() {
                 self.newest_s = Some(arrived_s);
@@ -148,16 +152,18 @@ impl InstrumentRenderer {
             }
         }
         self.last = self.wanted(now_s).unwrap_or(self.last);
+        let has_wrench = self.prediction.as_ref().is_some_and(|prediction| prediction.wrench().is_some());
         if let Some(prediction) = self.prediction.as_mut().filter(|_| is_known) {
-            self.predicted += u64::from(prediction.wrench().is_some());
-            prediction.keep(now_s, pose, DVec3::ZERO);
+            self.predicted += u64::from(has_wrench);
+            self.answered_s = if has_wrench { Some(now_s) } else { self.answered_s };
+            prediction.keep(now_s, &self.port.map_or(*pose, |port| port.lead(pose)), DVec3::ZERO);
         }
-        // What the copy does not answer is as old as its last answer.
-        let counts = self.newest.is_some() || self.envelope.is_engaged();
+        // What the copy does not answer is as old as its last wrench. Before the first, rendering does not engage.
+        let counts = has_wrench || self.envelope.is_engaged();
         let known_s = self.newest_s.zip(self.answered_s).map(|(newest_s, answered_s)| newest_s.min(answered_s));
         let age_s = known_s.filter(|_| counts).map(|known_s| now_s - known_s);
         let InstrumentVelocity { velocity_m_per_s, angular_rad_per_s, .. } = self.velocity;
-        let Wrench { force_n, torque_n_m } = self.last;
+        let Wrench { force_n, torque_n_m } = self.port.map_or(self.last, |port| port.on_device(pose, &self.last));
         // An orientation that is not finite is as bad as such a place.
         let place_m = if is_known { pose.place_m } else { DVec3::NAN };
         self.envelope.render_wrench(
@@ -268,7 +274,7 @@ mod tests {
         fn new(factor: f64) -> Self {
             let mut envelope = Envelope::new(Device::named("sigma7").unwrap(), DVec3::ZERO);
             envelope.enable();
-            let mut renderer = InstrumentRenderer::new(envelope);
+            let mut renderer = InstrumentRenderer::new(envelope, None);
             let is_off = Arc::new(AtomicBool::new(false));
             renderer.predict(Some(Prediction::new(Box::new(TurningCopy { factor, is_off: is_off.clone() }))));
             Loop { renderer, is_off, tick: 0 }

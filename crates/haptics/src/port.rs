@@ -103,6 +103,25 @@ impl Port {
         }
     }
 
+    /// Returns the wrench on a device at a pose, whose instrument [`Port::lead`] leads, about its place. `wrench` is that of the tissue on
+    /// the instrument, about the same place.
+    ///
+    /// The device moves at v and turns at ω; x is its own x axis and a the shaft's direction. The instrument then turns at
+    /// a×v/d + s·a, with s = (x + a)·ω/(1 + x·a) − x·(a×v)/(d·(1 + x·a)): it turns about itself as the device does, less what the
+    /// smallest turn from x to a does. So the power F·v + τ·(a×v)/d + s·τ·a is that of the force F + τ×a/d − (τ·a)·(x×a)/(d·(1 + x·a))
+    /// and the torque (τ·a)·(x + a)/(1 + x·a).
+    pub fn on_device(&self, device: &InstrumentPose, wrench: &Wrench) -> Wrench {
+        let (axis, depth_m) = self.shaft(&self.lead(device));
+        let own = device.orientation * DVec3::X;
+        // Where the device points away from the shaft, its turn does not tell that of the instrument: no torque then.
+        let sum = 1.0 + own.dot(axis);
+        let rolls = if sum > AWAY { wrench.torque_n_m.dot(axis) / sum } else { 0.0 };
+        Wrench {
+            force_n: wrench.force_n + (wrench.torque_n_m.cross(axis) - rolls * own.cross(axis)) / depth_m,
+            torque_n_m: rolls * (own + axis),
+        }
+    }
+
     /// Returns the direction of the shaft and the distance from the port to the instrument's place, m.
     fn shaft(&self, pose: &InstrumentPose) -> (DVec3, f64) {
         (pose.orientation * DVec3::X, self.place_m.distance(pose.place_m).max(MIN_FROM_PORT_M))
@@ -111,6 +130,9 @@ impl Port {
 
 /// Cosine of an angle down to which the axis of the turn by it is known to rounding.
 const OPPOSITE: f64 = -1.0 + 1e-12;
+
+/// 1 + cosine of the angle between a device and the shaft down to which the device gets torque about the shaft: 120°.
+const AWAY: f64 = 0.5;
 
 #[cfg(test)]
 mod tests {
@@ -177,6 +199,40 @@ mod tests {
             let axis = led.orientation * DVec3::X;
             assert!((moving.angular_rad_per_s - velocity.angular_rad_per_s).dot(axis).abs() < 1e-12);
         }
+    }
+
+    /// The power is that of the instrument, whose next pose follows from that of the device.
+    #[test]
+    fn a_device_gets_the_power_of_the_instrument_for_each_of_its_movements() {
+        let wrench = Wrench { force_n: DVec3::new(0.3, -0.7, 1.1), torque_n_m: DVec3::new(0.01, 0.02, -0.005) };
+        let mut compared = 0;
+        for device in poses() {
+            let led = PORT.lead(&device);
+            let cosine = (device.orientation * DVec3::X).dot(led.orientation * DVec3::X);
+            let on_device = PORT.on_device(&device, &wrench);
+            for number in 0..6 {
+                let unit = |first: usize| {
+                    DVec3::from_array(std::array::from_fn(|axis| f64::from(u8::from(number == first + axis))))
+                };
+                let velocity = InstrumentVelocity {
+                    velocity_m_per_s: 0.05 * unit(0),
+                    angular_rad_per_s: unit(3),
+                    jaw_rad_per_s: 0.0,
+                };
+                let time_s = 1e-6;
+                let next = PORT.lead(&velocity.after(&device, time_s));
+                let tissue_w = (wrench.force_n.dot(next.place_m - led.place_m)
+                    + wrench.torque_n_m.dot(led.turn_to(&next)))
+                    / time_s;
+                let device_w = on_device.force_n.dot(velocity.velocity_m_per_s)
+                    + on_device.torque_n_m.dot(velocity.angular_rad_per_s);
+                if 1.0 + cosine > AWAY {
+                    assert!((tissue_w - device_w).abs() < 1e-4, "{cosine} {number}: {tissue_w} {device_w}");
+                    compared += 1;
+                }
+            }
+        }
+        assert!(compared > 50, "{compared}");
     }
 
     #[test]

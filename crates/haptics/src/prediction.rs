@@ -240,11 +240,6 @@ impl Prediction {
         self.now.filter(|_| self.error.is_some()).map(|felt| self.sum(felt))
     }
 
-    /// Returns whether the copy had an answer in the last tick.
-    pub(crate) fn has_answer(&self) -> bool {
-        self.now.is_some()
-    }
-
     /// Returns c + e: 0 if the tool does not touch the copy.
     fn sum(&self, felt: Predicted) -> Wrench {
         let (error, size_n) = self.error.unwrap_or_default();

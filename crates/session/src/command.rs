@@ -15,7 +15,7 @@ pub struct Command {
     /// without `at_step` is played by this time.
     pub client_time_ns: u64,
     /// Whether it came by datagram, so that later poses may have overtaken it: its sequence number need not rise.
-    /// Only for poses that are played by client time.
+    /// Only for poses that are played by client time, and for releases in their place.
     pub by_datagram: bool,
     /// The step at whose beginning the command takes effect; `None` for the next step. If that step has passed, it
     /// acts at the next one and counts as late.

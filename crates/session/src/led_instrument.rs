@@ -5,6 +5,7 @@
 
 use std::collections::VecDeque;
 
+use glam::DVec3;
 use palpate_haptics::pose_playback::EXTRAPOLATE_S;
 use palpate_haptics::{Instrument, InstrumentPose, InstrumentVelocity, PortLoad, Wrench};
 
@@ -24,6 +25,8 @@ struct AcceptedPose {
     client_time_s: Option<f64>,
     pose: InstrumentPose,
     velocity: InstrumentVelocity,
+    /// Whether all tips are far from the tissue, so that none is led.
+    is_far: bool,
 }
 
 /// An instrument of a stream, with its newest poses.
@@ -115,18 +118,18 @@ impl LedInstrument {
 
     fn each(&self, command: &Command, action: impl Fn(usize) -> Action) -> Vec<Command> {
         let tools = (self.first_tool..).take(self.instrument.tips.len()).enumerate();
-        let each = |(number, tool)| {
-            let action = action(number);
-            // Only poses may be overtaken.
-            let by_datagram = command.by_datagram && matches!(action, Action::Pose { .. });
-            Command { tool, action, by_datagram, ..command.clone() }
-        };
-        tools.map(each).collect()
+        tools.map(|(number, tool)| Command { tool, action: action(number), ..command.clone() }).collect()
     }
 
-    /// Notes that the commands of [`LedInstrument::lead`] were accepted.
+    /// Notes that the commands of [`LedInstrument::lead`] were accepted. `is_far`: all of them release.
     #[allow(clippy::cast_precision_loss)]
-    pub fn accepted(&mut self, command: &Command, pose: InstrumentPose, velocity: Option<InstrumentVelocity>) {
+    pub fn accepted(
+        &mut self,
+        command: &Command,
+        pose: InstrumentPose,
+        velocity: Option<InstrumentVelocity>,
+        is_far: bool,
+    ) {
         if self.poses.len() == KEPT {
             self.poses.pop_front();
         }
@@ -136,24 +139,40 @@ impl LedInstrument {
         let (sequence, velocity) = (command.sequence.unwrap_or_default(), velocity.unwrap_or_default());
         // A datagram may have overtaken another.
         let after = self.poses.partition_point(|before| before.sequence < sequence);
-        self.poses.insert(after, AcceptedPose { sequence, client_time_s, pose, velocity });
+        self.poses.insert(after, AcceptedPose { sequence, client_time_s, pose, velocity, is_far });
     }
 
-    /// Returns what the instrument felt by a sample of its tools; `None` before its first pose has acted, and after its release.
+    /// Notes that the commands of [`LedInstrument::release`] were accepted.
+    pub fn released(&mut self) {
+        self.poses.clear();
+    }
+
+    /// Returns what the instrument felt by a sample of its tools; `None` before its first pose has acted, and after its release. One
+    /// that is far from the tissue feels nothing, where its newest pose has it.
     pub fn sample(&self, sample: &Sample) -> Option<InstrumentSample> {
         let tips = || sample.tools.iter().filter_map(|tool| Some((self.tip(tool.tool)?, tool)));
-        let led = tips().find(|(_, tool)| tool.feel.is_some())?.1;
+        let Some((_, led)) = tips().find(|(_, tool)| tool.feel.is_some()) else {
+            let far = self.poses.back().filter(|newest| newest.is_far)?;
+            return Some(self.felt(far.client_time_s?, far.pose, &[]));
+        };
         let pose = self.instrument.lead(&self.pose_at(led.acknowledged_sequence, led.place_time_s)?);
-        let forces_n = || tips().filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n)));
+        let forces_n: Vec<_> =
+            tips().filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n))).collect();
+        Some(self.felt(led.place_time_s, pose, &forces_n))
+    }
+
+    /// Returns what the instrument feels at a pose by forces on its tips, N.
+    fn felt(&self, client_time_s: f64, pose: InstrumentPose, forces_n: &[(usize, DVec3)]) -> InstrumentSample {
+        let forces_n = || forces_n.iter().copied();
         let wrench = self.instrument.wrench(&pose, forces_n());
-        Some(InstrumentSample {
+        InstrumentSample {
             first_tool: self.first_tool,
-            client_time_s: led.place_time_s,
+            client_time_s,
             pose,
             wrench,
-            port_load: self.instrument.port_load(&pose, &wrench),
             opening_n_m: self.instrument.has_jaws().then(|| self.instrument.opening_n_m(&pose, forces_n())),
-        })
+            port_load: self.instrument.port_load(&pose, &wrench),
+        }
     }
 
     /// Returns the pose of the command with a sequence number, or, for poses that are played by the client's time, that at a time

@@ -475,10 +475,10 @@ impl Session {
         let index = command.tool as usize;
         let tool = self.tool(index);
         // A pose that was overtaken fills a gap in a path; it does not begin a touch that a newer command has
-        // ended.
+        // ended. A release that was overtaken ends none that a newer command has begun.
         let is_overtaken =
             command.by_datagram && command.sequence.is_some_and(|sequence| sequence < tool.acknowledged_sequence);
-        if is_overtaken && tool.posed.is_none() {
+        if is_overtaken && (tool.posed.is_none() || command.action == Action::Release) {
             return;
         }
         if ends_lease {

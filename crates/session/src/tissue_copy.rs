@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_haptics::prediction::MAX_OTHERS;
-use palpate_haptics::{ContactState, Instrument, InstrumentPose, OtherTool, Predicted, Predictor, Tip, Wrench};
+use palpate_haptics::{ContactState, Instrument, InstrumentPose, OtherTool, Predicted, Predictor, Tip};
 
 use super::Session;
 use super::command::{Command, Due};
@@ -75,6 +75,8 @@ pub struct TissueCopy {
     rules: Rules,
     /// The client's instrument. Its tips are the first tools; other tools have the following ones.
     instrument: Instrument,
+    /// Whether it is a single tip, which is led wherever it is.
+    is_single: bool,
     /// Which of its tips are led.
     is_led: Vec<bool>,
     /// The other tools on the copy.
@@ -92,7 +94,7 @@ pub struct TissueCopy {
 impl TissueCopy {
     /// Creates a copy at rest, for a tool with this tip, without a limit of its work and without a check of the tip.
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
-        TissueCopy::of_instrument(model, Instrument::of_tip(tip))
+        TissueCopy { is_single: true, ..TissueCopy::of_instrument(model, Instrument::of_tip(tip)) }
     }
 
     /// Creates a copy at rest, for an instrument, without a limit of its work and without a check of the tips.
@@ -102,6 +104,7 @@ impl TissueCopy {
             session: Session::new(model),
             rules: Rules::new(&model.scene, &Limits::default()),
             instrument,
+            is_single: false,
             is_led: vec![false; tips],
             others: [None; MAX_OTHERS],
             work: vec![ToolWork::default(); tips],
@@ -132,7 +135,9 @@ impl TissueCopy {
             check_tip("tip", shape, &tip.tip)?;
             number("tip.radius_m", tip.tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
         }
-        Ok(TissueCopy::of_instrument(model, instrument.clone()).within(TICK_POINT_SUBSTEPS))
+        let single = instrument.tips.first().map(|tip| Instrument::of_tip(tip.tip));
+        let copy = TissueCopy::of_instrument(model, instrument.clone());
+        Ok(TissueCopy { is_single: single.as_ref() == Some(instrument), ..copy }.within(TICK_POINT_SUBSTEPS))
     }
 
     /// Steps until `now_s`, with the instrument on its way to `pose`, and the others on theirs. The number of steps is
@@ -165,16 +170,14 @@ impl TissueCopy {
         Some(())
     }
 
-    /// Leads the tips of the instrument to a pose. As a server does, releases those that are far from the tissue, unless there is
-    /// only one.
+    /// Leads the tips of the instrument to a pose. As a server does, releases those of an instrument that are far from the tissue.
     fn lead(&mut self, pose: &InstrumentPose) {
         let pose = self.instrument.lead(pose);
         let shape = self.session.model().shape();
-        let is_single = self.instrument.tips.len() == 1;
         for (number, is_led_now) in self.is_led.iter_mut().enumerate() {
             let (tip, place_m) = (self.instrument.tips[number].tip, self.instrument.tip_m(number, &pose));
             let tool = tool_at(number);
-            let was_led = std::mem::replace(is_led_now, is_single || is_led(shape, place_m, tip.radius_m));
+            let was_led = std::mem::replace(is_led_now, self.is_single || is_led(shape, place_m, tip.radius_m));
             if *is_led_now {
                 self.due.push(led(tool, place_m, tip));
             } else if was_led {
@@ -240,11 +243,7 @@ impl Predictor for TissueCopy {
         let tissue = self.session.tissue();
         let felt = || (0..self.work.len()).filter_map(|tool| Some((tool, tissue.tool_contact(tool)?)));
         let forces_n = felt().map(|(tool, contact)| (tool, contact.force_on_tool_n));
-        let wrench = match self.work.len() {
-            // A single tip turns with nothing.
-            1 => Wrench::of_force(forces_n.map(|(_, force_n)| force_n).sum()),
-            _ => self.instrument.wrench(&self.instrument.lead(pose), forces_n),
-        };
+        let wrench = self.instrument.wrench(&self.instrument.lead(pose), forces_n);
         // A tip that holds, sticks or slides says so for all.
         let touching = felt().map(|(_, contact)| contact.contact_state).find(|state| *state != ContactState::Free);
         let own_work_j = self.work.iter().map(|work| work.done_j).sum();
@@ -264,7 +263,7 @@ impl std::fmt::Debug for TissueCopy {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use palpate_haptics::MotionState;
+    use palpate_haptics::{MotionState, Wrench};
 
     /// Returns the place at a tick of a press of 3 mm and a stroke.
     fn place_m(tick: u32) -> DVec3 {

@@ -13,6 +13,8 @@ pub(super) enum StreamEvent {
         arrival_ns: u64,
         datagrams: Option<pb::DatagramOffer>,
     },
+    /// The tissue has changed from this step on; for a stream whose client has a copy of it and no force law.
+    TissueChanged(u64),
     /// A message of the client could not be read.
     Failed(Status),
     /// The client has closed its side of the stream.

@@ -157,14 +157,17 @@ impl LeaseController {
                 let (pose, velocity) = instrument::from_pose(pose, instrument.instrument())?;
                 let commands = instrument.lead(&command, &pose, velocity.as_ref(), self.handle.model.shape());
                 let reached = |command| within_reach(command, &self.handle, self.device.as_ref());
-                let commands = commands.into_iter().map(reached).collect::<Result<Commands>>()?;
+                let commands = commands.into_iter().map(reached).collect::<Result<Vec<Command>>>()?;
+                let is_far = commands.iter().all(|command| command.action == Action::Release);
                 self.handle.submit(self.lease, commands)?;
-                instrument.accepted(&command, pose, velocity);
+                instrument.accepted(&command, pose, velocity, is_far);
                 Ok(())
             }
             Some(Message::Release(_)) => {
                 let commands: Commands = instrument.release(&command).into_iter().collect();
-                self.handle.submit(self.lease, commands).map(drop)
+                self.handle.submit(self.lease, commands)?;
+                instrument.released();
+                Ok(())
             }
             _ => refuse(Reason::WrongKind, "action", "must be `instrument` or `release` for an instrument".to_owned()),
         }

@@ -84,6 +84,11 @@ impl HapticService for Haptics {
         }
         let lease = random_bits()?;
         let tools: Vec<u32> = once(request.tool).chain(request.more_tools).collect();
+        let most = self.0.config.limits.tools as usize;
+        if tools.len() > most {
+            let text = format!("are {}, and a session has {most} tools", tools.len());
+            return Err(Refusal::new(Reason::TooLarge, "more_tools", text).into());
+        }
         let charges = charges(&account, tools.len()).map_err(of_one_tool)?;
         handle
             .at_intake(|intake, now| {

@@ -15,6 +15,7 @@ use crate::server::recovered::Notices;
 use palpate_realtime::StreamGuard;
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::queue::Reader;
+use palpate_refusal::Reason;
 use palpate_session::led_instrument::LedInstrument;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
@@ -92,6 +93,12 @@ impl ResponseStream {
                         let server_hold_ns = now_ns().saturating_sub(arrival_ns);
                         Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns, datagrams })))
                     }
+                    Ok((StreamEvent::TissueChanged(step), _)) => Some(Ok(Message::ForceLaw(pb::ForceLawUpdate {
+                        tissue_step: Some(step),
+                        reason: Reason::NotAvailable.as_str().to_owned(),
+                        message: "an instrument has no force law".to_owned(),
+                        ..Default::default()
+                    }))),
                     Ok((StreamEvent::Failed(status), _)) => Some(Err(status)),
                     Ok((StreamEvent::Finished, _)) => None,
                     Err(refusal) => Some(Err(refusal.into())),

@@ -9,7 +9,7 @@ use futures_util::stream::Stream;
 use palpate_haptics::datagram_health::LIFE_S;
 use palpate_haptics::device::UNDECLARED_FORCE_N;
 use palpate_proto::{pb, touch};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::{Status, Streaming};
@@ -34,6 +34,7 @@ use palpate_session::budget::Account;
 use palpate_session::current_laws::{FIRST, Laws};
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
+use palpate_tissue::Model;
 use palpate_tissue::scene::action_check::check_tip;
 
 /// What the output of a haptic stream starts with.
@@ -56,6 +57,8 @@ struct StreamTools {
     /// If the client wants datagrams: when a session was last offered, ns, and the offered session until it arrives.
     offered_ns: Option<u64>,
     arrival: Option<Arrival>,
+    /// The tissue, if the client is told of its changes although it has no force law.
+    tissue: Option<watch::Receiver<(u64, Arc<Model>)>>,
     /// Computes further laws while the stream is open.
     _computing: Option<AbortOnDropHandle<()>>,
 }
@@ -152,6 +155,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     })?;
     let led = open.tools.first().copied();
     let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, led)).unzip();
+    let tissue = (!open.instruments.is_empty() && open.device.is_none()).then(|| handle.tissue());
     // The tools are held from here on: any failure below releases them.
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
@@ -166,8 +170,15 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
         instruments.clone(),
     );
     let channel = Arc::new(DatagramChannel::new(controller.pace()));
-    let mut held =
-        StreamTools { tools, controller, channel: channel.clone(), offered_ns: None, arrival: None, _computing };
+    let mut held = StreamTools {
+        tools,
+        controller,
+        channel: channel.clone(),
+        offered_ns: None,
+        arrival: None,
+        tissue,
+        _computing,
+    };
     let offered = if open.datagrams { services.datagrams.offer()? } else { None };
     let (datagrams, arrival) = offered.unzip();
     held.offered_ns = arrival.is_some().then(now_ns);
@@ -253,6 +264,10 @@ async fn listen(
     loop {
         let message = tokio::select! {
             message = early.next(&mut inbound) => message,
+            step = changed(&mut held.tissue) => {
+                events.push(StreamEvent::TissueChanged(step));
+                continue;
+            }
             datagram = channel.next(&mut held.arrival) => {
                 if let Err(refusal) = held.controller.datagram(datagram, &events) {
                     return events.close(refusal);
@@ -301,6 +316,16 @@ async fn listen(
             }
         }
     }
+}
+
+/// Waits for the next change of a tissue. Returns the step from which it acts.
+async fn changed(tissue: &mut Option<watch::Receiver<(u64, Arc<Model>)>>) -> u64 {
+    if let Some(tissue) = tissue
+        && tissue.changed().await.is_ok()
+    {
+        return tissue.borrow_and_update().0;
+    }
+    std::future::pending().await
 }
 
 /// The output of a haptic stream. Dropping it stops reading from the client and releases its tools.

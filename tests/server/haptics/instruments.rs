@@ -192,6 +192,34 @@ async fn an_instrument_in_a_port_stays_in_it() {
 }
 
 #[tokio::test]
+async fn an_instrument_that_is_far_away_feels_nothing_and_its_client_is_told_of_another_tissue() {
+    let server = TestServer::start(&[]);
+    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
+    let request = pb::CreateSessionRequest { source, ..Default::default() };
+    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
+    let mut touch = TestTouch::open(&server, with_grasper(&session.session_id)).await.unwrap();
+    let far = InstrumentPose { place_m: DVec3::new(0.0375, 0.0375, 0.2), ..pose_at(0) };
+    let told = pb::Command { client_time_ns: 7_000_000, at_step: None, ..command(0, instrument::pose(&far)) };
+    touch.command(told).await;
+    let sample = touch.sample_with(|sample| !sample.instruments.is_empty()).await;
+    let felt = sample.instruments[0];
+    assert_eq!((felt.client_time_ns, from_vector(felt.about_m.as_ref())), (7_000_000, far.place_m));
+    assert_eq!(from_vector(felt.force_on_tool_n.as_ref()), DVec3::ZERO);
+    let change = pb::UpdateTissueRequest {
+        session_id: session.session_id,
+        anchor_stiffness_n_per_m: Some(9.0),
+        ..Default::default()
+    };
+    let step = server.sessions().await.update_tissue(change).await.unwrap().into_inner().step;
+    let update = loop {
+        if let Some(pb::touch_response::Message::ForceLaw(update)) = touch.hear().await.unwrap() {
+            break update;
+        }
+    };
+    assert!(update.law.is_none() && update.tissue_step.is_some_and(|at| at >= step), "{update:?}");
+}
+
+#[tokio::test]
 async fn what_is_wrong_with_an_instrument_is_named() {
     let server = TestServer::start(&[]);
     let session = liver(&server).await;

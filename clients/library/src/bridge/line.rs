@@ -395,6 +395,7 @@ async fn connect(
                         }
                         match update.law {
                             Some(message) => feed.learn(&message)?,
+                            None if instrument.is_some() => {}
                             None => {
                                 let stays = if is_other_tissue { "that of the old tissue" } else { "a coarse one" };
                                 warn(&format!("the force law stays {stays}: {} ({})", update.message, update.reason));
@@ -422,6 +423,7 @@ async fn connect(
             }
             made = copying.next() => match made {
                 Ok(copy) => feed.predict(Some(copy)),
+                Err(error) if instrument.is_some() => warn(&format!("nothing is rendered: there is no copy of the tissue: {error}")),
                 Err(error) => warn(&format!("forces come from local models alone, without a copy of the tissue: {error}")),
             },
             sample = datagrams.next() => {

@@ -212,12 +212,9 @@ impl Ticker {
     /// Returns this loop as that of a device that leads an instrument, if there is one.
     #[must_use]
     pub(super) fn of_instrument(self, instrument: Option<Instrument>) -> Self {
-        if instrument.is_none() {
-            return self;
-        }
-        let envelope = Envelope::new(self.device, DVec3::ZERO);
-        let renderer = LoopRenderer::Instrument(Box::new(InstrumentRenderer::new(envelope)));
-        Ticker { renderer, instrument, ..self }
+        let Some(instrument) = instrument else { return self };
+        let renderer = InstrumentRenderer::new(Envelope::new(self.device, DVec3::ZERO), instrument.port);
+        Ticker { renderer: LoopRenderer::Instrument(Box::new(renderer)), instrument: Some(instrument), ..self }
     }
 
     /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`, s. The times may
@@ -249,10 +246,9 @@ impl Ticker {
             return Wrench::default();
         }
         let pose = match &self.instrument {
+            // A device may have a gripper, and its instrument no jaws.
             Some(instrument) => {
-                // A device may have a gripper, and its instrument no jaws.
-                let jaw_rad = if instrument.has_jaws() { jaw_rad } else { 0.0 };
-                instrument.lead(&InstrumentPose { place_m, orientation, jaw_rad })
+                InstrumentPose { place_m, orientation, jaw_rad: if instrument.has_jaws() { jaw_rad } else { 0.0 } }
             }
             None => InstrumentPose::at(place_m),
         };

@@ -195,7 +195,7 @@ impl ForceDimension {
             descriptor.force_n = descriptor.force_n.min(most_n);
             descriptor.continuous_n = descriptor.continuous_n.min(most_n);
         }
-        if calls.set_wrench.is_none() {
+        if calls.set_wrench.is_none() || calls.orientation.is_none() {
             descriptor.torque_n_m = 0.0;
         }
         let model = model.unwrap_or_else(|| format!("system {system}"));
@@ -212,13 +212,19 @@ impl ForceDimension {
     }
 
     /// Reads orientation and gripper. A device without them keeps the neutral ones.
-    fn read_handle(&mut self) {
+    ///
+    /// # Errors
+    /// Returns an error if a device that renders torque does not tell its orientation.
+    fn read_handle(&mut self) -> io::Result<()> {
         let mut rows = [[0.0; 3]; 3];
         // SAFETY: room for nine numbers that live during the call, and the device is open.
         let told = self.calls.orientation.map(|get| unsafe { get(&raw mut rows, self.id) });
         let handle = DMat3::from_cols_array_2d(&rows).transpose() * HANDLE;
         let axes = [handle.x_axis, handle.y_axis, handle.z_axis].map(of_device);
         let is_rotation = (handle.determinant() - 1.0).abs() < 1e-3;
+        if self.descriptor.torque_n_m > 0.0 {
+            self.hold(told.filter(|_| is_rotation).unwrap_or(-1), "its orientation can't be read")?;
+        }
         if told.is_some_and(|told| told >= 0) && is_rotation {
             self.orientation = DQuat::from_mat3(&DMat3::from_cols(axes[0], axes[1], axes[2])).normalize();
         }
@@ -226,8 +232,10 @@ impl ForceDimension {
         // SAFETY: a number that lives during the call, and the device is open.
         let told = self.calls.gripper.map(|get| unsafe { get(&raw mut angle_rad, self.id) });
         if told.is_some_and(|told| told >= 0) && angle_rad.is_finite() {
-            self.jaw_rad = angle_rad.clamp(0.0, MAX_JAW_RAD);
+            // Grippers for the left hand tell negative angles.
+            self.jaw_rad = angle_rad.abs().min(MAX_JAW_RAD);
         }
+        Ok(())
     }
 
     /// Returns an error if a call failed.
@@ -254,7 +262,7 @@ impl HapticDevice for ForceDimension {
         // SAFETY: as above.
         let pressed = |index| unsafe { (self.calls.button)(index, self.id) } == 1;
         self.buttons = (0..BUTTONS).filter(|index| pressed(*index)).map(|index| 1 << index).sum();
-        self.read_handle();
+        self.read_handle()?;
         Ok(Reading { place_m: of_device(DVec3::new(x, y, z)), enable: self.buttons & 1 != 0 })
     }
 

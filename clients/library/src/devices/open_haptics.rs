@@ -35,6 +35,7 @@ const VERSION: c_uint = 0x2500;
 const MODEL: c_uint = 0x2501;
 const MAX_WORKSPACE: c_uint = 0x2550;
 const USABLE_WORKSPACE: c_uint = 0x2551;
+const OUTPUT_DOF: c_uint = 0x2554;
 const MAX_STIFFNESS: c_uint = 0x2602;
 const MAX_FORCE: c_uint = 0x2603;
 const MAX_CONTINUOUS_FORCE: c_uint = 0x2604;
@@ -48,6 +49,8 @@ const CALLBACK_CONTINUE: c_uint = 1;
 const FORCE_ERRORS: std::ops::Range<c_uint> = 0x0200..0x0300;
 /// Number of errors that are read at once.
 const MAX_ERRORS: u32 = 16;
+/// Output axes of a device that renders torque.
+const SIX_AXES: c_int = 6;
 /// `HD_MAX_SCHEDULER_PRIORITY`.
 const PRIORITY: c_ushort = c_ushort::MAX;
 
@@ -217,9 +220,13 @@ unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
     unsafe {
         (calls.begin)(*handle);
         (calls.get_numbers)(CURRENT_POSITION, place_mm.as_mut_ptr());
-        (calls.get_numbers)(CURRENT_TRANSFORM, transform.as_mut_ptr());
         (calls.get_whole)(CURRENT_BUTTONS, &raw mut buttons);
     }
+    let failure = calls.failure();
+    // SAFETY: as above.
+    unsafe { (calls.get_numbers)(CURRENT_TRANSFORM, transform.as_mut_ptr()) };
+    // A library without a transform leaves the stylus as it was.
+    let _ = calls.failure();
     let (force_n, torque_mn_m) = {
         let mut exchange = shared.exchange();
         exchange.place_mm = [place_mm[0], place_mm[1], place_mm[2]];
@@ -239,7 +246,7 @@ unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
         }
         (calls.end)(*handle);
     }
-    match calls.failure() {
+    match failure.or(calls.failure()) {
         None => CALLBACK_CONTINUE,
         Some(code) => {
             // Tries to set the force to zero, in case the device still accepts it.
@@ -247,6 +254,9 @@ unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
             unsafe {
                 (calls.begin)(*handle);
                 (calls.set_numbers)(CURRENT_FORCE, [0.0; 3].as_ptr());
+                if torque_mn_m.is_some() {
+                    (calls.set_numbers)(CURRENT_TORQUE, [0.0; 3].as_ptr());
+                }
                 (calls.end)(*handle);
             }
             let _ = calls.failure();
@@ -373,6 +383,10 @@ fn describe(calls: &OpenHapticsCalls) -> (Device, DVec3) {
         let [a, b, c, d, e, f] = calls.numbers(parameter);
         (DVec3::new(a, b, c), DVec3::new(d, e, f))
     };
+    let mut outputs = 0;
+    // SAFETY: a number that lives during the call.
+    unsafe { (calls.get_whole)(OUTPUT_DOF, &raw mut outputs) };
+    let _ = calls.failure();
     let (least_mm, most_mm) = corners(USABLE_WORKSPACE);
     let whole_mm = corners(MAX_WORKSPACE);
     let reach_m = 0.5e-3 * (whole_mm.1 - whole_mm.0).length();
@@ -383,7 +397,7 @@ fn describe(calls: &OpenHapticsCalls) -> (Device, DVec3) {
         stiffness_n_per_m: told(MAX_STIFFNESS, 1e3, table.stiffness_n_per_m),
         damping_n_s_per_m: told(MAX_DAMPING, 1e3, table.damping_n_s_per_m),
         workspace_m: if reach_m.is_finite() && reach_m > 0.0 { reach_m } else { table.workspace_m },
-        torque_n_m: told(MAX_TORQUE, 1e-3, 0.0),
+        torque_n_m: if outputs == SIX_AXES { told(MAX_TORQUE, 1e-3, 0.0) } else { 0.0 },
     };
     let middle_mm = 0.5 * (least_mm + most_mm);
     (descriptor, if middle_mm.is_finite() { middle_mm } else { DVec3::ZERO })

@@ -114,7 +114,7 @@ impl Placement {
 
 /// A device whose workspace is placed over the tissue, rotated and scaled, with a clutch.
 ///
-/// While the clutch is held, the tool stays where it is and the device gets no force. When it is released, the tool
+/// While the clutch is held, the tool stays where it is, as it is turned, and the device gets no force. When it is released, the tool
 /// continues from there, unless it would be shifted by more than 1 m in all; forces return once the rendered force is
 /// below [`ENGAGED_N`], as outside the tissue: none starts within it.
 #[derive(Debug)]
@@ -124,8 +124,13 @@ pub struct Placed<D> {
     rotation: DQuat,
     /// Shift by the clutch, in the tissue's frame, m.
     shift_m: DVec3,
-    /// The tool's place while the clutch is held, m.
+    /// The tool's place while the clutch is held, m, and its orientation.
     held_m: Option<DVec3>,
+    held_turn: Option<DQuat>,
+    /// Turn by the clutch, in the tissue's frame.
+    shift: DQuat,
+    /// The lever at which the device's torque counts as a force, m.
+    lever_m: f64,
     /// Whether the clutch is held, or was released and the envelope's force has not been small since.
     is_shut: bool,
     begun: Option<Instant>,
@@ -139,8 +144,19 @@ impl<D: HapticDevice> Placed<D> {
     pub fn new(device: D, placement: Placement) -> Result<Self> {
         placement.check()?;
         let rotation = placement.rotation();
-        let (shift_m, held_m, is_shut, begun) = (DVec3::ZERO, None, false, None);
-        Ok(Placed { device, placement, rotation, shift_m, held_m, is_shut, begun })
+        let lever_m = device.descriptor().lever_m();
+        Ok(Placed {
+            device,
+            placement,
+            rotation,
+            shift_m: DVec3::ZERO,
+            held_m: None,
+            held_turn: None,
+            shift: DQuat::IDENTITY,
+            lever_m,
+            is_shut: false,
+            begun: None,
+        })
     }
 
     /// Returns the device that was placed, with its own frame and limits.
@@ -151,7 +167,8 @@ impl<D: HapticDevice> Placed<D> {
     /// Returns the wrench of the tool as that of the device. The powers of force and torque have the same ratio on both sides, so that
     /// what is passive stays so: ways are scaled, turns are not.
     fn pass(&mut self, wrench: Wrench) -> Wrench {
-        if self.held_m.is_none() && wrench.force_n.length() < ENGAGED_N {
+        let turns_n = if self.lever_m > 0.0 { wrench.torque_n_m.length() / self.lever_m } else { 0.0 };
+        if self.held_m.is_none() && wrench.force_n.length().max(turns_n) < ENGAGED_N {
             self.is_shut = false;
         }
         if self.is_shut {
@@ -196,16 +213,21 @@ impl<D: HapticDevice> HapticDevice for Placed<D> {
         let buttons = self.device.buttons();
         let enable = self.asks(reading, buttons);
         let laid_m = self.placement.offset_m + self.placement.scale * (self.rotation * reading.place_m);
+        let laid = self.rotation * self.device.orientation();
         let is_held = self.placement.clutch_button.is_some_and(|button| buttons >> button & 1 != 0);
         let place_m = match (is_held, self.held_m) {
             (true, held_m) => {
                 self.is_shut = true;
+                self.held_turn.get_or_insert(self.shift * laid);
                 *self.held_m.insert(held_m.unwrap_or(laid_m + self.shift_m))
             }
             (false, Some(held_m)) => {
                 // It continues from where it stood.
                 self.shift_m = (held_m - laid_m).clamp_length_max(SHIFT_M);
                 self.held_m = None;
+                if let Some(held) = self.held_turn.take() {
+                    self.shift = (held * laid.inverse()).normalize();
+                }
                 laid_m + self.shift_m
             }
             (false, None) => laid_m + self.shift_m,
@@ -219,7 +241,7 @@ impl<D: HapticDevice> HapticDevice for Placed<D> {
     }
 
     fn orientation(&self) -> DQuat {
-        self.rotation * self.device.orientation()
+        self.held_turn.unwrap_or(self.shift * self.rotation * self.device.orientation())
     }
 
     fn jaw_rad(&self) -> f64 {

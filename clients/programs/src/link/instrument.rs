@@ -157,8 +157,9 @@ impl LedTissue {
         let by_datagram = self.by_datagram && client_time_ns != 0;
         let command = Command { client_time_ns, by_datagram, ..Command::new(0, Some(number), Action::Release) };
         let commands = self.led.lead(&command, pose, None, self.simulation.session.model().shape());
+        let is_far = commands.iter().all(|command| command.action == Action::Release);
         self.simulation.intake.submit(LEASE, commands, ns(now_s)).map_err(|refusal| refusal.to_string())?;
-        self.led.accepted(&command, *pose, None);
+        self.led.accepted(&command, *pose, None, is_far);
         Ok(())
     }
 
@@ -309,7 +310,7 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
     server.by_datagram = setup.conditions.transport == Transport::Datagram;
     let mut envelope = Envelope::new(setup.device, setup.spot.of_tissue(setup.spot.at_m));
     envelope.enable();
-    let mut renderer = InstrumentRenderer::new(envelope);
+    let mut renderer = InstrumentRenderer::new(envelope, None);
     let copy = TissueCopy::of_instrument(&setup.model, instrument.clone());
     renderer.predict(Some(Prediction::new(Box::new(copy))));
     let mut hand = TurningHand::new(setup.hand, course.task.start_m());
