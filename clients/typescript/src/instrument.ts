@@ -57,8 +57,8 @@ export class Instrument {
   /** Adds a row of equal tips between two places of the instrument's frame: a capsule, if they are a radius apart. */
   addRow(fromM: Vec3, toM: Vec3, tip: Tip, part: InstrumentPart, spacingM = tip.radiusM): this {
     const way = plus(toM, fromM, -1);
-    const gaps = Math.min(Math.max(Math.ceil(norm(way) / spacingM), 1), MAX_TIPS);
-    for (let at = 0; at <= gaps; at++) this.tips.push({ offsetM: plus(fromM, way, at / gaps), tip, part });
+    const gaps = Math.min(Math.ceil(norm(way) / spacingM), MAX_TIPS);
+    for (let at = 0; at <= gaps; at++) this.tips.push({ offsetM: plus(fromM, way, at / Math.max(gaps, 1)), tip, part });
     return this;
   }
 

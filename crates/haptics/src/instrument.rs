@@ -87,12 +87,13 @@ impl Instrument {
         }
     }
 
-    /// Adds a row of equal tips, from `from_m` to `to_m` (m, in the instrument's frame), at most a radius apart: a capsule.
+    /// Adds a row of equal tips, from `from_m` to `to_m` (m, in the instrument's frame), at most a radius apart: a capsule. One tip if
+    /// both are the same place.
     pub fn add_row(&mut self, from_m: DVec3, to_m: DVec3, tip: Tip, part: InstrumentPart) {
         // Saturating cast: a length without end gives more tips than an instrument may have.
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-        let gaps = ((from_m.distance(to_m) / tip.radius_m).ceil() as usize).clamp(1, MAX_TIPS);
-        let offsets_m = (0..=gaps).map(|at| from_m.lerp(to_m, at as f64 / gaps as f64));
+        let gaps = ((from_m.distance(to_m) / tip.radius_m).ceil() as usize).min(MAX_TIPS);
+        let offsets_m = (0..=gaps).map(|at| from_m.lerp(to_m, at as f64 / gaps.max(1) as f64));
         self.tips.extend(offsets_m.map(|offset_m| InstrumentTip { offset_m, tip, part }));
     }
 
@@ -202,6 +203,10 @@ mod tests {
         );
         let apart_m = instrument.tip_m(0, &pose).distance(instrument.tip_m(1, &pose));
         assert!(apart_m <= 0.002 + 1e-15, "{apart_m} m");
+        // Jaws as short as a tip is wide have one tip each.
+        let mut short = Instrument::default();
+        short.add_parts(Some((0.004, Tip { radius_m: 0.002, ..Tip::default() })), None);
+        assert_eq!(short.tips.len(), 2);
     }
 
     #[test]
