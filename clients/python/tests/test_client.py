@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import math
 import threading
 import unittest
 from pathlib import Path
@@ -36,7 +37,7 @@ class Hand:
 
 
 class Handle(Hand):
-    """A device of six axes, whose instrument lies along x and presses 2 mm deep."""
+    """A device of six axes, whose instrument lies along x and presses 1 mm deep once a second."""
 
     limits = "sigma7"
 
@@ -45,8 +46,10 @@ class Handle(Hand):
         self.orientation, self.torques = orientation, []
 
     def read(self):
-        place_m, enable = super().read()
-        return place_m, enable, self.orientation, 0.2
+        _, enable = super().read()
+        # Forces begin while it is above the tissue, where it comes again and again.
+        height_m = 0.001 + 0.002 * math.cos(2.0 * math.pi * self.readings / 1000.0)
+        return (0.0, 0.0, height_m), enable, self.orientation, 0.2
 
     def write(self, force_n, torque_n_m):
         super().write(force_n)
@@ -218,7 +221,7 @@ class Clients(Served, unittest.TestCase):
         with palpate.connect(self.url).create_session("liver") as session:
             for _ in range(20):
                 handle = Handle()
-                touched = session.touch(handle, seconds=2.0, instrument=instrument)
+                touched = session.touch(handle, seconds=3.0, instrument=instrument)
                 if touched.largest_torque_n_m > 1e-3:
                     break
             # What presses the shaft, which lies along -x of the tip, up, turns it about y.
