@@ -1,11 +1,11 @@
 """A real server, touched and looked at, with and without asyncio."""
 
 import asyncio
+import math
 import os
 import subprocess
 import sys
 import tempfile
-import math
 import threading
 import unittest
 from pathlib import Path
