@@ -140,10 +140,10 @@ impl InstrumentRenderer {
                 self.velocity.angular_rad_per_s = turned_rad / elapsed_s;
             }
         }
+        let led = self.port.map_or(*pose, |port| port.lead(pose));
         if is_known {
             self.before = Some((now_s, *pose));
             if let Some(prediction) = &mut self.prediction {
-                let led = self.port.map_or(*pose, |port| port.lead(pose));
                 self.envelope.supply(prediction.move_to(now_s, &led, &self.others));
             }
             if let Some((sample, arrived_s)) = self.arrived.take() {
@@ -156,7 +156,7 @@ impl InstrumentRenderer {
         if let Some(prediction) = self.prediction.as_mut().filter(|_| is_known) {
             self.predicted += u64::from(has_wrench);
             self.answered_s = if has_wrench { Some(now_s) } else { self.answered_s };
-            prediction.keep(now_s, &self.port.map_or(*pose, |port| port.lead(pose)), DVec3::ZERO);
+            prediction.keep(now_s, &led, DVec3::ZERO);
         }
         // What the copy does not answer is as old as its last wrench. Before the first, rendering does not engage.
         let counts = has_wrench || self.envelope.is_engaged();

@@ -40,9 +40,9 @@ fn port_at(place_m: DVec3, handle_m: f64) -> pb::Port {
     pb::Port { position_m: vector(place_m), handle_m }
 }
 
-async fn liver(server: &TestServer) -> String {
+async fn liver(server: &TestServer, paused: bool) -> String {
     let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
-    let request = pb::CreateSessionRequest { source, paused: true, ..Default::default() };
+    let request = pb::CreateSessionRequest { source, paused, ..Default::default() };
     server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id
 }
 
@@ -70,7 +70,7 @@ fn forces_n(sample: &pb::Sample) -> Vec<DVec3> {
 async fn one_pose_moves_all_tips_and_samples_have_the_wrench() {
     const STEPS: u64 = 300;
     let server = TestServer::start(&[]);
-    let (together, apart) = (liver(&server).await, liver(&server).await);
+    let (together, apart) = (liver(&server, true).await, liver(&server, true).await);
     let mut as_one = TestTouch::open(&server, with_grasper(&together)).await.unwrap();
     let mut as_many = TestTouch::open(&server, open(&apart, &tools())).await.unwrap();
     let grasper = grasper();
@@ -117,10 +117,8 @@ async fn one_pose_moves_all_tips_and_samples_have_the_wrench() {
 #[tokio::test]
 async fn an_instrument_is_led_by_the_clients_time() {
     let server = TestServer::start(&[]);
-    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
-    let request = pb::CreateSessionRequest { source, ..Default::default() };
-    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
-    let mut touch = TestTouch::open(&server, with_grasper(&session.session_id)).await.unwrap();
+    let session = liver(&server, false).await;
+    let mut touch = TestTouch::open(&server, with_grasper(&session)).await.unwrap();
     let velocity = InstrumentVelocity {
         velocity_m_per_s: -0.02 * DVec3::Z,
         angular_rad_per_s: 2.0 * DVec3::Z,
@@ -154,13 +152,11 @@ async fn an_instrument_is_led_by_the_clients_time() {
 #[tokio::test]
 async fn an_instrument_in_a_port_stays_in_it() {
     let server = TestServer::start(&[]);
-    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
-    let request = pb::CreateSessionRequest { source, ..Default::default() };
-    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
+    let session = liver(&server, false).await;
     let port = Port { place_m: DVec3::new(0.0375, 0.0375, 0.12), handle_m: 0.33 };
     let shaft = Instrument { port: Some(port), ..grasper() };
     let instruments = vec![instrument::instrument(&shaft, FIRST)];
-    let open = pb::TouchOpen { instruments, ..open(&session.session_id, &tools()) };
+    let open = pb::TouchOpen { instruments, ..open(&session, &tools()) };
     let mut touch = TestTouch::open(&server, open).await.unwrap();
     let place_m =
         |tick: u64| DVec3::new(0.0375 + 0.01 * (0.02 * tick as f64).sin(), 0.0375, 0.003 - 2e-5 * tick as f64);
@@ -194,10 +190,8 @@ async fn an_instrument_in_a_port_stays_in_it() {
 #[tokio::test]
 async fn an_instrument_that_is_far_away_feels_nothing_and_its_client_is_told_of_another_tissue() {
     let server = TestServer::start(&[]);
-    let source = Some(pb::create_session_request::Source::SceneName("liver".into()));
-    let request = pb::CreateSessionRequest { source, ..Default::default() };
-    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
-    let mut touch = TestTouch::open(&server, with_grasper(&session.session_id)).await.unwrap();
+    let session = liver(&server, false).await;
+    let mut touch = TestTouch::open(&server, with_grasper(&session)).await.unwrap();
     let far = InstrumentPose { place_m: DVec3::new(0.0375, 0.0375, 0.2), ..pose_at(0) };
     let told = pb::Command { client_time_ns: 7_000_000, at_step: None, ..command(0, instrument::pose(&far)) };
     touch.command(told).await;
@@ -205,11 +199,8 @@ async fn an_instrument_that_is_far_away_feels_nothing_and_its_client_is_told_of_
     let felt = sample.instruments[0];
     assert_eq!((felt.client_time_ns, from_vector(felt.about_m.as_ref())), (7_000_000, far.place_m));
     assert_eq!(from_vector(felt.force_on_tool_n.as_ref()), DVec3::ZERO);
-    let change = pb::UpdateTissueRequest {
-        session_id: session.session_id,
-        anchor_stiffness_n_per_m: Some(9.0),
-        ..Default::default()
-    };
+    let change =
+        pb::UpdateTissueRequest { session_id: session, anchor_stiffness_n_per_m: Some(9.0), ..Default::default() };
     let step = server.sessions().await.update_tissue(change).await.unwrap().into_inner().step;
     let update = loop {
         if let Some(pb::touch_response::Message::ForceLaw(update)) = touch.hear().await.unwrap() {
@@ -222,7 +213,7 @@ async fn an_instrument_that_is_far_away_feels_nothing_and_its_client_is_told_of_
 #[tokio::test]
 async fn what_is_wrong_with_an_instrument_is_named() {
     let server = TestServer::start(&[]);
-    let session = liver(&server).await;
+    let session = liver(&server, true).await;
     let message = || instrument::instrument(&grasper(), FIRST);
     let with = |change: &dyn Fn(&mut pb::Instrument)| {
         let mut instrument = message();
