@@ -45,7 +45,7 @@ pub(crate) struct BridgeArguments {
     /// are those of the first, but for --second-offset-m
     #[arg(long, value_name = "NAME", requires = "session")]
     second_device: Option<String>,
-    /// The tool of the second device [default: one more than --tool]
+    /// The tool of the second device, of an instrument the first one [default: the one after those of the first device]
     #[arg(long, value_name = "NUMBER", requires = "second_device")]
     second_tool: Option<u32>,
     /// Offset of the second device's workspace from that of the first, m
@@ -63,11 +63,12 @@ pub(crate) struct BridgeArguments {
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
     radius_m: f64,
     /// The device leads an instrument, by its position and orientation: jaws of this length, m, whose angle is that of the device's
-    /// gripper. Its tips have --tip and --radius-m, and are the tools from --tool on. Force and torque come from a copy of the tissue
-    #[arg(long, value_name = "M", conflicts_with_all = ["second_device", "up_deadband", "deadband"])]
+    /// gripper. Its tips have --tip and --radius-m, and are the tools from --tool on. Force and torque come from a copy of the tissue.
+    /// A second device leads an equal instrument
+    #[arg(long, value_name = "M", conflicts_with_all = ["up_deadband", "deadband"])]
     jaws_m: Option<f64>,
     /// The device leads an instrument with a shaft of this length, m, behind its jaws if it has any
-    #[arg(long, value_name = "M", conflicts_with_all = ["second_device", "up_deadband", "deadband"])]
+    #[arg(long, value_name = "M", conflicts_with_all = ["up_deadband", "deadband"])]
     shaft_m: Option<f64>,
     /// The shaft of the instrument slides through this place, as through a trocar, m, in the tissue's frame
     #[arg(long, value_name = "X,Y,Z", value_parser = vector, allow_hyphen_values = true)]
@@ -194,7 +195,9 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
     let (served, second) = match &arguments.second_device {
         None => (run(first, target, options(None), interrupted()).await?.1, None),
         Some(name) => {
-            let tool = arguments.second_tool.unwrap_or(arguments.tool.saturating_add(1));
+            #[allow(clippy::cast_possible_truncation)] // At most MAX_TIPS.
+            let tips = instrument.as_ref().map_or(1, |instrument| instrument.tips.len() as u32);
+            let tool = arguments.second_tool.unwrap_or(arguments.tool.saturating_add(tips));
             let placement = Placement { offset_m: placement.offset_m + arguments.second_offset_m, ..placement };
             let device = Placed::new(device(arguments, name, 1)?, placement)?;
             let ([left, right], beside) = (two_hands(), Target { tool, ..target.clone() });

@@ -8,6 +8,7 @@
 
 mod copy_fetch;
 mod copy_thread;
+mod hand_slot;
 mod hands;
 mod lateness;
 mod line;
@@ -32,6 +33,7 @@ use crate::device::HapticDevice;
 use crate::os::{self, Priority};
 use line::{Commands, Shared};
 
+pub use hand_slot::{HandSlot, two_hand_slots};
 pub use hands::{BridgeHand, two_hands};
 pub use line::Traffic;
 pub use offline::{Offline, OfflineNetwork};
@@ -136,8 +138,9 @@ pub struct Options {
     /// it, however long that takes: while it is late, or if it can't be built, forces come from local models. `None`:
     /// only from those.
     pub copies: Option<Copies>,
-    /// One of the two hands of this client ([`two_hands`]), whose other one leads another tool of the same session: each copy of
-    /// the tissue then has both tools without a delay. `None`: this device is the only one.
+    /// One of the two hands of this client ([`two_hands`]), whose other one leads another tool or instrument of the same session:
+    /// each copy of the tissue then has the tools of both without a delay, at most 32 of the other hand. `None`: this device is the
+    /// only one.
     pub hand: Option<BridgeHand>,
     /// The instrument that the device leads, by its position, orientation and jaws; its tips are the tools from
     /// [`Target::tool`] on. Force and torque come from a copy of the tissue, so `copies` is needed. `None`: the single tip of
@@ -321,8 +324,7 @@ struct Led {
 
 impl Led {
     /// # Errors
-    /// Returns [`Error::Argument`] for an instrument without tips or without a copy of the tissue, whose tools have no numbers, or that
-    /// is one of two hands.
+    /// Returns [`Error::Argument`] for an instrument without tips or without a copy of the tissue, or whose tools have no numbers.
     fn of(target: &Target, options: &mut Options) -> Result<Self, Error> {
         let Options { hand, instrument, copies, .. } = options;
         let refuse = |why: &str| Err(Error::Argument(format!("instrument: {why}")));
@@ -333,9 +335,6 @@ impl Led {
             }
             if copies.is_none() {
                 return refuse("is rendered from a copy of the tissue: allow copies");
-            }
-            if hand.is_some() {
-                return refuse("can't be one of two hands: connect each hand by a bridge of its own");
             }
         }
         Ok(Led { hand: hand.take(), instrument: instrument.take() })

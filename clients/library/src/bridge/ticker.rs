@@ -105,7 +105,7 @@ pub struct Ticker {
     news: News,
     clock: Clock,
     place_m: DVec3,
-    /// One of two hands of this client, with its tool and tip.
+    /// One of two hands of this client, with its first tool, and the tip of that if it leads no instrument.
     hand: Option<(BridgeHand, u32, Tip)>,
     /// The time by the client's clock at which the other tools of the newest model were where it says, s; `None` before the
     /// first model.
@@ -159,7 +159,7 @@ pub(super) fn ticker(
         place_m: DVec3::ZERO,
         hand: None,
         others_time_s: None,
-        others: Vec::with_capacity(1 + MAX_OTHERS),
+        others: Vec::with_capacity(2 * MAX_OTHERS),
     };
     let feed = LoopFeed {
         told: to_learn,
@@ -203,7 +203,8 @@ impl Clock {
 }
 
 impl Ticker {
-    /// Returns this loop as that of one of two hands, if `hand` is one, which leads a tool with a tip.
+    /// Returns this loop as that of one of two hands, if `hand` is one, which leads a tool with a tip, or an instrument from that tool
+    /// on.
     #[must_use]
     pub(super) fn of_hand(self, hand: Option<BridgeHand>, tool: u32, tip: Tip) -> Self {
         Ticker { hand: hand.map(|hand| (hand, tool, tip)), ..self }
@@ -265,19 +266,31 @@ impl Ticker {
         }
         self.is_fresh &= !is_news;
         let of_time = |other: OtherTool, time_s| OtherTool { motion: MotionState { time_s, ..other.motion }, ..other };
-        let mut second = None;
-        if let Some((hand, tool, tip)) = &mut self.hand {
-            let motion = MotionState { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO };
-            hand.tell(Some(OtherTool { tool: *tool, tip: *tip, motion }));
-            second = hand.other().map(|other| of_time(other, now_s));
-        }
         if is_news || self.hand.is_some() {
             self.others.clear();
-            self.others.extend(second);
+            if let Some((hand, first, tip)) = &mut self.hand {
+                let at = |tool, tip, place_m| {
+                    let motion = MotionState { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO };
+                    OtherTool { tool, tip, motion }
+                };
+                match &self.instrument {
+                    Some(instrument) => {
+                        let led = instrument.lead(&pose);
+                        let tips = instrument.tips.iter().zip(*first..).enumerate();
+                        hand.tell(tips.map(|(number, (of, tool))| at(tool, of.tip, instrument.tip_m(number, &led))));
+                    }
+                    None => hand.tell(std::iter::once(at(*first, *tip, place_m))),
+                }
+                self.others.extend(hand.other().map(|other| of_time(other, now_s)));
+            }
+            let own = self.others.len();
             if let Some(time_s) = self.others_time_s.filter(|_| connection == self.connection) {
-                let known = others.iter().map_while(|other| *other);
-                let known = known.filter(|other| second.is_none_or(|second| second.tool != other.tool));
-                self.others.extend(known.map(|other| of_time(other, time_s)));
+                for other in others.iter().map_while(|other| *other) {
+                    // What the own second hand leads is known better by that.
+                    if self.others[..own].iter().all(|second| second.tool != other.tool) {
+                        self.others.push(of_time(other, time_s));
+                    }
+                }
             }
             renderer.follow_others(&self.others);
         }
@@ -478,7 +491,7 @@ impl LoopFeed {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use palpate_haptics::{ContactState, InstrumentPose, Predicted, Wrench};
+    use palpate_haptics::{ContactState, InstrumentPose, Port, Predicted, Wrench};
 
     use super::super::hands::two_hands;
     use super::*;
@@ -546,5 +559,42 @@ mod tests {
         let left_over: Vec<u32> = heard().iter().map(|other| other.tool).collect();
         // The server still has its tool.
         assert_eq!(left_over, [1, 5]);
+    }
+
+    #[test]
+    fn a_copy_has_all_tips_of_the_instrument_of_the_own_second_hand_where_its_port_lets_them_be() {
+        let device = Device::named("sigma7").unwrap();
+        let port = Some(Port { place_m: DVec3::new(0.02, 0.0, 0.2), handle_m: 0.33 });
+        let tip = Tip { radius_m: 0.003, ..Tip::default() };
+        let mut grasper = Instrument { port, ..Instrument::default() };
+        grasper.add_parts(Some((0.015, tip)), Some((0.02, tip)));
+        let [left, right] = two_hands();
+        let one_of = |hand: BridgeHand, first: u32| {
+            let (ticker, feed, commands) = ticker(device, PositionOrigin::Tissue, 0.0);
+            let ticker = ticker.of_hand(Some(hand), first, Tip::default()).of_instrument(Some(grasper.clone()));
+            (ticker, feed, commands)
+        };
+        let (mut left, mut left_feed, _left_commands) = one_of(left, 0);
+        let (mut right, mut right_feed, _right_commands) = one_of(right, 40);
+        let (say, mut told) = newest(&Vec::new());
+        left_feed.begin(None, DVec3::ZERO).unwrap();
+        left_feed.predict(Some(Box::new(TellingCopy(say))));
+        right_feed.begin(None, DVec3::ZERO).unwrap();
+        let reading = |x_m: f64| Reading { place_m: DVec3::new(x_m, 0.0, 0.001), enable: true };
+        right.tick_turned(reading(0.02), DQuat::IDENTITY, 0.5, 0.0005);
+        // A sample knows some of the second hand's tools too.
+        let others = (44..48).map(|tool| pb::OtherTool {
+            tool,
+            position_m: Some(pb::Vector3 { x: 0.0, y: 0.0, z: 0.0 }),
+            ..Default::default()
+        });
+        left_feed.receive(&sample(1, 1_000_000_000, others.collect()), 0.0);
+        left.tick_turned(reading(0.0), DQuat::IDENTITY, 0.0, 0.001);
+        assert!(told.refresh());
+        let led = grasper.lead(&InstrumentPose { jaw_rad: 0.5, ..InstrumentPose::at(DVec3::new(0.02, 0.0, 0.001)) });
+        let expected: Vec<_> = (0..grasper.tips.len()).map(|number| grasper.tip_m(number, &led)).collect();
+        let found: Vec<_> = told.read().iter().map(|other| other.motion.place_m).collect();
+        assert_eq!(found, expected);
+        assert!(told.read().iter().zip(40..).all(|(other, tool)| other.tool == tool && other.tip == tip));
     }
 }
