@@ -17,6 +17,16 @@ namespace Palpate
         public double Length { get { return Math.Sqrt(X * X + Y * Y + Z * Z); } }
     }
 
+    /// <summary>An orientation of length 1, in the axes that were requested; see palpate_quaternion.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Orientation
+    {
+        public double W, X, Y, Z;
+        public Orientation(double w, double x, double y, double z) { W = w; X = x; Y = y; Z = z; }
+        /// <summary>Not turned: the instrument points along Palpate's x.</summary>
+        public static Orientation Identity { get { return new Orientation(1.0, 0.0, 0.0, 0.0); } }
+    }
+
     /// <summary>Axes and unit of positions, normals and forces; see palpate_axes.</summary>
     public enum Axes : uint { Own = 0, Unity = 1, Unreal = 2 }
 
@@ -58,6 +68,40 @@ namespace Palpate
         public bool IsOver { get { return isOver != 0; } }
     }
 
+    /// <summary>What a device of six axes reports; see palpate_instrument_reading.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct InstrumentReading
+    {
+        public Vector Position;
+        public Orientation Orientation;
+        /// <summary>Angle between the jaws, rad.</summary>
+        public double JawAngle;
+        uint enable, unused;
+        public InstrumentReading(Vector position, Orientation orientation, double jawAngle, bool enabled)
+        {
+            Position = position;
+            Orientation = orientation;
+            JawAngle = jawAngle;
+            enable = enabled ? 1u : 0u;
+            unused = 0;
+        }
+        public bool Enable { get { return enable != 0; } set { enable = value ? 1u : 0u; } }
+    }
+
+    /// <summary>Result of a tick with an instrument; see palpate_instrument_felt.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct InstrumentFelt
+    {
+        public Vector Force, Torque;
+        /// <summary>Orientation of the instrument, whose shaft passes through the port.</summary>
+        public Orientation Orientation;
+        uint state, isOver;
+        /// <summary>Age of the newest data about the tissue, s; negative before the first.</summary>
+        public double Age;
+        public State State { get { return (State)state; } }
+        public bool IsOver { get { return isOver != 0; } }
+    }
+
     /// <summary>Limits of a haptic device; see palpate_limits.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Limits
@@ -81,6 +125,22 @@ namespace Palpate
     {
         public ulong Ticks;
         public Vector Position, Force;
+        uint state, priority, isOver, unused;
+        public State State { get { return (State)state; } }
+        public Priority Priority { get { return (Priority)priority; } }
+        public bool IsOver { get { return isOver != 0; } }
+    }
+
+    /// <summary>State of an instrument; see palpate_instrument_state.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct InstrumentState
+    {
+        public ulong Ticks;
+        public Vector Position;
+        public Orientation Orientation;
+        /// <summary>Angle between the jaws, rad.</summary>
+        public double JawAngle;
+        public Vector Force, Torque;
         uint state, priority, isOver, unused;
         public State State { get { return (State)state; } }
         public Priority Priority { get { return (Priority)priority; } }
@@ -135,6 +195,22 @@ namespace Palpate
         public uint Prediction;
         /// <summary>How the tip presses.</summary>
         public TipShape TipShape;
+        /// <summary>Length of an instrument's jaws and of its shaft, m; 0: none.</summary>
+        public double Jaws, Shaft;
+        uint hasPort;
+        /// <summary>The place through which the shaft slides, in the tissue's frame, if HasPort.</summary>
+        public Vector Port;
+        /// <summary>Distance from the instrument's tip to its handle, m.</summary>
+        public double Handle;
+        /// <summary>Largest torque of the device, N·m; 0: it renders none.</summary>
+        public double MaxTorque;
+        internal IntPtr Hand;
+        public bool HasPort { get { return hasPort != 0; } set { hasPort = value ? 1u : 0u; } }
+        /// <summary>How many tools a loop with these options moves: one for each tip of an instrument.</summary>
+        public uint ToolCount
+        {
+            get { uint count; Native.Check(Native.palpate_tool_count(ref this, out count)); return count; }
+        }
         public bool InTissueFrame { get { return inTissueFrame != 0; } set { inTissueFrame = value ? 1u : 0u; } }
         public bool Grasps { get { return grasps != 0; } set { grasps = value ? 1u : 0u; } }
         public bool Datagrams { get { return datagrams != 0; } set { datagrams = value ? 1u : 0u; } }
@@ -175,6 +251,8 @@ namespace Palpate
     [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Descriptor(IntPtr user, out Limits limits);
     [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Read(IntPtr user, out Reading reading);
     [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Write(IntPtr user, ref Vector force);
+    [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int ReadInstrument(IntPtr user, ref InstrumentReading reading);
+    [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int WriteInstrument(IntPtr user, ref Vector force, ref Vector torque);
     delegate Code WriteText(byte[] text, UIntPtr capacity, out UIntPtr needed);
 
     static class Native
@@ -208,6 +286,12 @@ namespace Palpate
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_traffic(IntPtr touch, out Traffic traffic);
         [DllImport(Library, CallingConvention = C)] internal static extern void palpate_touch_end(IntPtr touch);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_begin(IntPtr session, ref DeviceCalls device, ref TouchOptions options, out IntPtr bridge);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_tool_count(ref TouchOptions options, out uint count);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_two_hands(out IntPtr left, out IntPtr right);
+        [DllImport(Library, CallingConvention = C)] internal static extern void palpate_hand_free(IntPtr hand);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_tick_instrument(IntPtr touch, ref InstrumentReading reading, double time, out InstrumentFelt felt);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_begin_instrument(IntPtr session, ref DeviceCalls device, ref TouchOptions options, out IntPtr bridge);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_look_instrument(IntPtr bridge, out InstrumentState state);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_look(IntPtr bridge, out BridgeState state);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_disable(IntPtr bridge);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_end(IntPtr bridge, out Report report);
@@ -259,6 +343,22 @@ namespace Palpate
             GC.SuppressFinalize(this);
         }
         ~Handle() { Dispose(); }
+    }
+
+    /// <summary>One of the two hands of a program; see palpate_two_hands.</summary>
+    public sealed class Hand : Handle
+    {
+        Hand(IntPtr pointer) { Pointer = pointer; }
+
+        /// <summary>Returns the two hands of a program.</summary>
+        public static Hand[] Two()
+        {
+            IntPtr left, right;
+            Native.Check(Native.palpate_two_hands(out left, out right));
+            return new[] { new Hand(left), new Hand(right) };
+        }
+
+        internal override void Free(IntPtr pointer) { Native.palpate_hand_free(pointer); }
     }
 
     /// <summary>A connection to a server.</summary>
@@ -382,16 +482,42 @@ namespace Palpate
         /// <summary>Deletes the session on the server, for all users. Waits for the server.</summary>
         public void Delete() { Native.Check(Native.palpate_session_delete(Pointer)); }
 
-        /// <summary>Takes a tool for a loop of your own. Waits for the server.</summary>
-        public Touch Touch(TouchOptions options)
+        /// <summary>Takes a tool, or an instrument, for a loop of your own. Waits for the server.</summary>
+        public Touch Touch(TouchOptions options, Hand hand = null)
         {
             IntPtr touch;
-            Native.Check(Native.palpate_touch_begin(Pointer, ref options, out touch));
+            options.Hand = Of(hand);
+            var code = Native.palpate_touch_begin(Pointer, ref options, out touch);
+            GC.KeepAlive(hand);
+            Native.Check(code);
             return new Touch(touch);
         }
 
         /// <summary>Connects a device, on a thread of the library. Waits for the server.</summary>
-        public Bridge Bridge(IDevice device, TouchOptions options) { return new Bridge(Pointer, device, options); }
+        public Bridge Bridge(IDevice device, TouchOptions options, Hand hand = null)
+        {
+            options.Hand = Of(hand);
+            var bridge = new Bridge(Pointer, device, options);
+            GC.KeepAlive(hand);
+            return bridge;
+        }
+
+        /// <summary>Connects a device of six axes, on a thread of the library. The options need Jaws or Shaft. Waits for the
+        /// server.</summary>
+        public Bridge Bridge(IInstrumentDevice device, TouchOptions options, Hand hand = null)
+        {
+            options.Hand = Of(hand);
+            var bridge = new Bridge(Pointer, device, options);
+            GC.KeepAlive(hand);
+            return bridge;
+        }
+
+        static IntPtr Of(Hand hand)
+        {
+            if (hand == null) return IntPtr.Zero;
+            if (hand.Pointer == IntPtr.Zero) throw new ObjectDisposedException("hand");
+            return hand.Pointer;
+        }
 
         /// <summary>Gets the surface. Waits for the server.</summary>
         public Surface Surface(Axes axes, int refinement = 0, double rate = 60.0) { return new Surface(Pointer, axes, refinement, rate); }
@@ -424,6 +550,15 @@ namespace Palpate
             return felt;
         }
 
+        /// <summary>Returns force and torque until the next tick, for options with an instrument. The rules are those of the
+        /// other Tick.</summary>
+        public InstrumentFelt Tick(InstrumentReading reading, double time)
+        {
+            InstrumentFelt felt;
+            Native.palpate_touch_tick_instrument(Pointer, ref reading, time, out felt);
+            return felt;
+        }
+
         /// <summary>Stops rendering until Enable goes from false to true again.</summary>
         public void Disable() { Native.Check(Native.palpate_touch_disable(Pointer)); }
 
@@ -445,27 +580,49 @@ namespace Palpate
         void Write(Vector force);
     }
 
+    /// <summary>A device of your own with six axes, which leads an instrument. The rules are those of IDevice. The largest
+    /// torque is MaxTorque of the options.</summary>
+    public interface IInstrumentDevice
+    {
+        Limits Limits { get; }
+        InstrumentReading Read();
+        void Write(Vector force, Vector torque);
+    }
+
     /// <summary>The loop that drives a device.</summary>
     public sealed class Bridge : Handle
     {
         // The library calls these until the loop ends.
         readonly Descriptor descriptor;
-        readonly Read read;
-        readonly Write write;
+        readonly Delegate read, write;
         string thrown;
 
         internal Bridge(IntPtr session, IDevice device, TouchOptions options)
         {
             descriptor = (IntPtr user, out Limits limits) => { limits = default(Limits); try { limits = device.Limits; return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
-            read = (IntPtr user, out Reading reading) => { reading = default(Reading); try { reading = device.Read(); return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
-            write = (IntPtr user, ref Vector force) => { try { device.Write(force); return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
-            var calls = new DeviceCalls
+            read = new Read((IntPtr user, out Reading reading) => { reading = default(Reading); try { reading = device.Read(); return 0; } catch (Exception e) { thrown = e.Message; return 1; } });
+            write = new Write((IntPtr user, ref Vector force) => { try { device.Write(force); return 0; } catch (Exception e) { thrown = e.Message; return 1; } });
+            var calls = Calls();
+            Check(Native.palpate_bridge_begin(session, ref calls, ref options, out Pointer));
+        }
+
+        internal Bridge(IntPtr session, IInstrumentDevice device, TouchOptions options)
+        {
+            descriptor = (IntPtr user, out Limits limits) => { limits = default(Limits); try { limits = device.Limits; return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
+            read = new ReadInstrument((IntPtr user, ref InstrumentReading reading) => { try { reading = device.Read(); return 0; } catch (Exception e) { thrown = e.Message; return 1; } });
+            write = new WriteInstrument((IntPtr user, ref Vector force, ref Vector torque) => { try { device.Write(force, torque); return 0; } catch (Exception e) { thrown = e.Message; return 1; } });
+            var calls = Calls();
+            Check(Native.palpate_bridge_begin_instrument(session, ref calls, ref options, out Pointer));
+        }
+
+        DeviceCalls Calls()
+        {
+            return new DeviceCalls
             {
                 Descriptor = Marshal.GetFunctionPointerForDelegate(descriptor),
                 Read = Marshal.GetFunctionPointerForDelegate(read),
                 Write = Marshal.GetFunctionPointerForDelegate(write),
             };
-            Check(Native.palpate_bridge_begin(session, ref calls, ref options, out Pointer));
         }
 
         void Check(Code code)
@@ -478,6 +635,14 @@ namespace Palpate
         {
             BridgeState state;
             Native.Check(Native.palpate_bridge_look(Pointer, out state));
+            return state;
+        }
+
+        /// <summary>Returns where the instrument is and what is rendered. Throws if the device leads none.</summary>
+        public InstrumentState LookInstrument()
+        {
+            InstrumentState state;
+            Native.Check(Native.palpate_bridge_look_instrument(Pointer, out state));
             return state;
         }
 

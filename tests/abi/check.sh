@@ -66,9 +66,11 @@ if echo 'int main(void) { return 0; }' | cc -x c - -fsanitize=address -o "$work/
     compile errors-asan clients/c/tests/errors.c -fsanitize=address
     compile look-asan clients/c/examples/look.c -fsanitize=address
     compile touch-asan clients/c/examples/touch.c -fsanitize=address
+    compile hands-asan clients/c/examples/hands.c -fsanitize=address
     ASAN_OPTIONS=detect_leaks=1 "$work/errors-asan" "$url"
     ASAN_OPTIONS=detect_leaks=1 "$work/look-asan" "$url" liver 1
     ASAN_OPTIONS=detect_leaks=1 "$work/touch-asan" "$url" liver 3
+    ASAN_OPTIONS=detect_leaks=1 "$work/hands-asan" "$url" liver 60
     say 'the address sanitizer has found nothing'
 else
     say 'LEFT OUT: the C compiler has no address sanitizer'

@@ -104,7 +104,23 @@ fn assert_looked(output: &Output, heights: &str) {
     assert!(told[heights].as_array().unwrap().iter().all(|z_m| z_m.as_f64().unwrap().abs() < 1e-3), "{told}");
 }
 
+/// Checks the output of an example in which two hands press liver with a grasper each.
+fn assert_both_hands_felt(output: &Output, min_torque_n_m: f64) {
+    let told = told(output);
+    // Two jaws and a shaft: rows of tips.
+    assert!((8..30).contains(&told["tools"].as_u64().unwrap()), "{told}");
+    for hand in 0..2 {
+        assert!((0.05..3.3).contains(&told["force_max_n"][hand].as_f64().unwrap()), "{told}");
+        let torque_n_m = told["torque_max_n_m"][hand].as_f64().unwrap();
+        assert!((min_torque_n_m..0.11).contains(&torque_n_m), "{told}");
+        assert!(told["force_at_end_n"][hand].as_f64().is_none_or(|force_n| force_n == 0.0), "{told}");
+    }
+}
+
 const RUN: [&str; 2] = ["liver", "2"];
+
+/// The examples with two hands end when both have felt the tissue.
+const RUN_UNTIL_FELT: [&str; 2] = ["liver", "60"];
 
 #[tokio::test]
 async fn examples_in_c_press_look_and_connect_a_device() {
@@ -121,6 +137,8 @@ async fn examples_in_c_press_look_and_connect_a_device() {
     let told = told(&output);
     assert_eq!(told["force_at_end_n"].as_f64(), Some(0.0), "{told}");
     assert!(["real time", "refused"].contains(&told["priority"].as_str().unwrap()), "{told}");
+    let hands = compiled("clients/c/examples/hands.c", &[]);
+    assert_both_hands_felt(&done(ours(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 1e-4);
     // Wrong names end with a message and a status.
     for (url, scene) in [("http://127.0.0.1:1", "liver"), (server.url.as_str(), "nowhere")] {
         let refused = ours(&touch).args([url, scene, "1"]).output().unwrap();
@@ -161,6 +179,9 @@ async fn examples_in_cpp_press_look_and_show() {
     let server = TestServer::start(&[]);
     let run = |program: &Path| done(ours(program).arg(&server.url).args(RUN));
     assert_looked(&run(&compiled("clients/cpp/examples/look.cpp", &["-fno-exceptions"])), "z_m");
+    // In a port only the turn about the shaft is felt as a torque.
+    let hands = compiled("clients/cpp/examples/hands.cpp", &[]);
+    assert_both_hands_felt(&done(ours(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 0.0);
     // The others by the CMake package, where there is CMake.
     let built = folder().join("cmake");
     let program = |name: &str| built.join(name);
@@ -209,6 +230,8 @@ async fn examples_in_cs_press_look_and_show() {
     assert_looked(&run(&compiled_cs("clients/csharp/examples/Look.cs")), "y_m");
     assert_pressed(&run(&compiled_cs("clients/csharp/examples/TouchIt.cs")), true);
     assert_pressed(&run(&compiled_cs("clients/csharp/examples/FrontEnd.cs")), false);
+    let hands = compiled_cs("clients/csharp/examples/Hands.cs");
+    assert_both_hands_felt(&done(mono(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 1e-4);
     done(mono(&compiled_cs("clients/csharp/tests/Errors.cs")).arg(&server.url));
 }
 

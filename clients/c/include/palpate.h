@@ -154,6 +154,11 @@ typedef enum palpate_tip_shape {
 typedef struct palpate_bridge palpate_bridge;
 
 /**
+ * One of the two hands of a program, from `palpate_two_hands` to `palpate_hand_free`. Any thread.
+ */
+typedef struct palpate_hand palpate_hand;
+
+/**
  * A connection to a server, with the caller's credentials, from `palpate_connect` to `palpate_server_free`. Any
  * thread, also several at once.
  */
@@ -267,7 +272,8 @@ typedef struct palpate_device {
 typedef void (*palpate_warn)(void *user, const char *message);
 
 /**
- * Options of `palpate_touch_begin`, `palpate_touch_begin_offline` and `palpate_bridge_begin`. Texts are copied.
+ * Options of `palpate_touch_begin`, `palpate_touch_begin_offline`, `palpate_bridge_begin` and
+ * `palpate_bridge_begin_instrument`. Texts are copied.
  */
 typedef struct palpate_touch_options {
   /**
@@ -344,6 +350,40 @@ typedef struct palpate_touch_options {
    * How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Others touch solids alone, and do not hold.
    */
   uint32_t tip_shape;
+  /**
+   * Length of the jaws of an instrument, which end at the device's position, m, at most 0.5; 0 (default): none. With jaws
+   * or a shaft the device leads an instrument, by its position, orientation and jaws: a row of tips for each jaw and for
+   * the shaft, at most 64 in all, a tip at least for each `tip_radius_m`. Each tip is a tool, with the numbers from `tool`
+   * on (`palpate_tool_count`). Force and torque come from a copy of the tissue, also if `prediction` is 0. `grasps`,
+   * `deadband` and `up_deadband` must be 0.
+   */
+  double jaws_m;
+  /**
+   * Length of the shaft behind the jaws, or behind the device's position, m, at most 0.5; 0 (default): none.
+   */
+  double shaft_m;
+  /**
+   * 1: the shaft slides through `port` and turns about it, as through a trocar; 0 (default): it moves freely.
+   */
+  uint32_t has_port;
+  /**
+   * The place of the port, always in the tissue's frame, in the axes of the options.
+   */
+  struct palpate_vector port;
+  /**
+   * Distance from the tip of the instrument to its handle, m, 0.01 to 2; default 0.33. The shaft passes through the port
+   * between both.
+   */
+  double handle_m;
+  /**
+   * Largest torque of the device, N·m, 0 to 100; 0 (default): it renders none.
+   */
+  double max_torque_n_m;
+  /**
+   * One of the two hands of `palpate_two_hands`, if your program moves two tools or instruments; null (default): this
+   * is the only one.
+   */
+  const struct palpate_hand *hand;
 } palpate_touch_options;
 
 /**
@@ -413,6 +453,151 @@ typedef struct palpate_bridge_report {
    */
   uint32_t result;
 } palpate_bridge_report;
+
+/**
+ * An orientation in the axes of the options: it turns vectors of a device's frame into the frame around it, by the
+ * formula that engines and textbooks use. Its length is 1.
+ */
+typedef struct palpate_quaternion {
+  /**
+   * The cosine of half of the angle.
+   */
+  double w;
+  /**
+   * The axis times the sine of half of the angle: its component along x.
+   */
+  double x;
+  /**
+   * The component along y.
+   */
+  double y;
+  /**
+   * The component along z.
+   */
+  double z;
+} palpate_quaternion;
+
+/**
+ * Where a device of six axes is at a tick, and whether its operator requests forces.
+ */
+typedef struct palpate_instrument_reading {
+  /**
+   * Position, in the axes and frame of `palpate_touch_options`.
+   */
+  struct palpate_vector position;
+  /**
+   * Orientation, of length 1, in the axes of `palpate_touch_options`. Not turned, that is {1, 0, 0, 0}, the instrument
+   * points along Palpate's x, and its jaws open in Palpate's y.
+   */
+  struct palpate_quaternion orientation;
+  /**
+   * Angle between the jaws, rad, 0 while they are closed. One outside 0 to π counts as the nearest within.
+   */
+  double jaw_rad;
+  /**
+   * Whether the operator requests forces, by a button or pedal. Only a change from 0 to another value enables
+   * them.
+   */
+  uint32_t enable;
+} palpate_instrument_reading;
+
+/**
+ * What an instrument felt in a tick: force and torque, and the state of the rendering.
+ */
+typedef struct palpate_instrument_felt {
+  /**
+   * The force on the hand until the next tick, N.
+   */
+  struct palpate_vector force_n;
+  /**
+   * The torque on the hand until the next tick, about the position of the reading, N·m. Zero unless the options have a
+   * `max_torque_n_m`.
+   */
+  struct palpate_vector torque_n_m;
+  /**
+   * The orientation of the instrument: that of the reading, with a port turned so that the shaft passes through it.
+   */
+  struct palpate_quaternion orientation;
+  /**
+   * Whether forces are rendered: one of `palpate_state`.
+   */
+  uint32_t state;
+  /**
+   * 1 if the connection has ended for good, else 0.
+   */
+  uint32_t is_over;
+  /**
+   * Age of the newest data of the tissue, s; negative before the first.
+   */
+  double age_s;
+} palpate_instrument_felt;
+
+/**
+ * A device of your own with six axes, for `palpate_bridge_begin_instrument`. The rules are those of `palpate_device`.
+ */
+typedef struct palpate_instrument_device {
+  /**
+   * Passed to the functions.
+   */
+  void *user;
+  /**
+   * Writes the limits of the device. Called once, before the loop starts, by the thread that starts it. The largest
+   * torque is `max_torque_n_m` of the options.
+   */
+  int32_t (*descriptor)(void *user, struct palpate_limits *limits);
+  /**
+   * Writes the device's position, orientation and jaw angle, in the axes of the options; the origin is the middle of its
+   * workspace. The orientation is {1, 0, 0, 0} before the call.
+   */
+  int32_t (*read)(void *user, struct palpate_instrument_reading *reading);
+  /**
+   * Sets force and torque to render until the next tick, N and N·m, in the axes of the options; the torque is about the
+   * device's position.
+   */
+  int32_t (*write)(void *user, const struct palpate_vector *force_n, const struct palpate_vector *torque_n_m);
+} palpate_instrument_device;
+
+/**
+ * The state of an instrument after the last tick of its loop, from `palpate_bridge_look_instrument`.
+ */
+typedef struct palpate_instrument_state {
+  /**
+   * Number of ticks so far.
+   */
+  uint64_t ticks;
+  /**
+   * The place of the instrument at the last tick, in the tissue's frame, in the axes of the options.
+   */
+  struct palpate_vector position;
+  /**
+   * The orientation of the instrument: that of the device, with a port turned so that the shaft passes through it.
+   */
+  struct palpate_quaternion orientation;
+  /**
+   * Angle between the jaws, rad.
+   */
+  double jaw_rad;
+  /**
+   * The force rendered at the last tick, N.
+   */
+  struct palpate_vector force_n;
+  /**
+   * The torque rendered at the last tick, N·m.
+   */
+  struct palpate_vector torque_n_m;
+  /**
+   * Whether forces are rendered: one of `palpate_state`.
+   */
+  uint32_t state;
+  /**
+   * The priority of the loop's thread: one of `palpate_priority`.
+   */
+  uint32_t priority;
+  /**
+   * 1 if the loop has ended; `palpate_bridge_end` returns why.
+   */
+  uint32_t is_over;
+} palpate_instrument_state;
 
 /**
  * Options of `palpate_connect`. Texts are copied.
@@ -694,6 +879,59 @@ enum palpate_result palpate_bridge_end(struct palpate_bridge *bridge, struct pal
 const char *palpate_last_error(void);
 
 /**
+ * Creates the two hands of a program, for `hand` of `palpate_touch_options`. Begin two loops in one session, each with one
+ * of the hands and with tools of its own: each hand's copy of the tissue then has the tools of the other hand at once,
+ * without the delay of the network (of an instrument with more than 32 tips, the first 32). So it has an effect only if
+ * the tissue is copied: with `prediction`, or for an instrument. Each hand serves one loop, also if that can't begin.
+ * Writes two handles for `palpate_hand_free`. Any thread.
+ */
+enum palpate_result palpate_two_hands(struct palpate_hand **left,
+                                      struct palpate_hand **right);
+
+/**
+ * Frees the handle of a hand; a loop that has begun with it continues. Null is allowed. Any thread, once.
+ */
+void palpate_hand_free(struct palpate_hand *hand);
+
+/**
+ * Writes the number of tools that a loop with these options moves: one for each tip of an instrument, with the numbers
+ * from `tool` on; 1 for a single tip. `options` may be null. Returns `PALPATE_ARGUMENT` for options that are not valid.
+ * Any thread.
+ */
+enum palpate_result palpate_tool_count(const struct palpate_touch_options *options, uint32_t *count);
+
+/**
+ * Writes force and torque to render from now on, for a device of six axes that reports `reading` at `time_s`. The options
+ * of `palpate_touch_begin` need `jaws_m` or `shaft_m`. Takes bounded time, as `palpate_touch_tick` does. Returns
+ * `PALPATE_ARGUMENT` if a number is not finite or the length of the orientation is not 1: `felt` then has a force and a
+ * torque that fall to zero. After any other error they are zero. One thread at a time: another gets `PALPATE_BUSY`.
+ */
+enum palpate_result palpate_touch_tick_instrument(const struct palpate_touch *touch,
+                                                  const struct palpate_instrument_reading *reading,
+                                                  double time_s,
+                                                  struct palpate_instrument_felt *felt);
+
+/**
+ * Connects a device of six axes to a session, as `palpate_bridge_begin` connects one of three. The device leads an
+ * instrument: `jaws_m` or `shaft_m` of the options must be above 0. Writes a handle for `palpate_bridge_end`. The loop
+ * ends with `PALPATE_DEVICE` also if `read` writes an orientation whose length is not 1; a number that is not finite
+ * makes the state FAULT. At the end of the loop, for any reason, `write` gets a force and a torque of zero. Any thread;
+ * waits for the server.
+ */
+enum palpate_result palpate_bridge_begin_instrument(const struct palpate_session *session,
+                                                    const struct palpate_instrument_device *device,
+                                                    const struct palpate_touch_options *options,
+                                                    struct palpate_bridge **bridge);
+
+/**
+ * Writes where the instrument of a loop is and what is rendered, after the last tick, or, if a thread was just reading
+ * that, after the tick before. Returns `PALPATE_ARGUMENT` if the loop leads no instrument. Never waits for the loop or
+ * the server. Any thread.
+ */
+enum palpate_result palpate_bridge_look_instrument(const struct palpate_bridge *bridge,
+                                                   struct palpate_instrument_state *state);
+
+/**
  * Sets all options to their defaults; `size` is `sizeof *options`. Any thread.
  */
 enum palpate_result palpate_connect_options_init(struct palpate_connect_options *options, size_t size);
@@ -883,7 +1121,8 @@ enum palpate_result palpate_touch_begin(const struct palpate_session *session,
  * Creates a loop that renders recordings, without a server: equal messages, positions and times give equal forces,
  * bit by bit. It has no copy of the tissue; `prediction` is ignored. `options` may be null; `middle_m` is the place
  * in the tissue of the middle of the workspace (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for
- * `palpate_touch_end`. Any thread.
+ * `palpate_touch_end`. Returns `PALPATE_ARGUMENT` also for an instrument and for a hand, which need a copy of the
+ * tissue. Any thread.
  */
 enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_options *options,
                                                 struct palpate_vector middle_m,
@@ -901,7 +1140,8 @@ enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch, cons
 /**
  * Writes the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, of
  * a clock that advances between ticks. Takes bounded time: no lock, no call of the system, no memory allocated or
- * freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. Returns
+ * freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. An instrument is
+ * not turned, and its jaws are closed: `palpate_touch_tick_instrument` has more. Returns
  * `PALPATE_ARGUMENT` if the position or the time is not finite: `felt` then has a force that falls to zero. After
  * any other error, `felt` has a force of zero. One thread at a time: another gets `PALPATE_BUSY`.
  */

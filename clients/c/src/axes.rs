@@ -1,6 +1,6 @@
 //! The coordinate frames of engines: directions of their axes, and length of their units.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 
 use crate::error::CodedError;
 
@@ -38,6 +38,28 @@ impl palpate_vector {
 
     pub(crate) fn vector(self) -> DVec3 {
         DVec3::new(self.x, self.y, self.z)
+    }
+}
+
+/// An orientation in the axes of the options: it turns vectors of a device's frame into the frame around it, by the
+/// formula that engines and textbooks use. Its length is 1.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct palpate_quaternion {
+    /// The cosine of half of the angle.
+    pub w: f64,
+    /// The axis times the sine of half of the angle: its component along x.
+    pub x: f64,
+    /// The component along y.
+    pub y: f64,
+    /// The component along z.
+    pub z: f64,
+}
+
+impl Default for palpate_quaternion {
+    /// Returns the orientation that is not turned.
+    fn default() -> Self {
+        palpate_quaternion { w: 1.0, x: 0.0, y: 0.0, z: 0.0 }
     }
 }
 
@@ -85,6 +107,29 @@ impl palpate_axes {
         palpate_vector::own(self.turned(force_n))
     }
 
+    /// Converts a torque, N·m, to these axes. In left-handed axes its direction is opposite: a × b is, too.
+    pub(crate) fn torque(self, torque_n_m: DVec3) -> palpate_vector {
+        palpate_vector::own(self.axial(torque_n_m))
+    }
+
+    /// Converts an orientation to these axes: vectors of the device's frame are converted too.
+    pub(crate) fn rotation(self, orientation: DQuat) -> palpate_quaternion {
+        let [x, y, z] = self.axial(orientation.xyz()).to_array();
+        palpate_quaternion { w: orientation.w, x, y, z }
+    }
+
+    /// Converts an orientation in these axes to Palpate's own.
+    pub(crate) fn to_rotation(self, orientation: palpate_quaternion) -> DQuat {
+        let palpate_quaternion { w, x, y, z } = orientation;
+        let DVec3 { x, y, z } = self.axial(DVec3::new(x, y, z));
+        DQuat::from_xyzw(x, y, z, w)
+    }
+
+    /// Converts the axis of a rotation, which is its own inverse. Exchanging two axes reverses the sense of each rotation.
+    fn axial(self, v: DVec3) -> DVec3 {
+        if self == PALPATE_AXES_OWN { v } else { -self.turned(v) }
+    }
+
     /// Returns whether triangles have their corners in clockwise order.
     pub(crate) fn is_clockwise(self) -> bool {
         self == PALPATE_AXES_UNITY
@@ -93,5 +138,25 @@ impl palpate_axes {
     /// Returns whether the texture coordinate v starts at the top.
     pub(crate) fn has_top_first(self) -> bool {
         self == PALPATE_AXES_UNREAL
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rotation_turns_what_an_engine_sees_as_it_turns_the_tissue() {
+        let (v, force_n) = (DVec3::new(0.3, -0.7, 0.2), DVec3::new(-1.0, 0.4, 2.0));
+        let turn = DQuat::from_rotation_x(0.4) * DQuat::from_rotation_z(-1.1);
+        for axes in [PALPATE_AXES_OWN, PALPATE_AXES_UNITY, PALPATE_AXES_UNREAL] {
+            let palpate_quaternion { w, x, y, z } = axes.rotation(turn);
+            let seen = DQuat::from_xyzw(x, y, z, w) * axes.turned(v);
+            assert!((seen - axes.turned(turn * v)).length() < 1e-15, "{axes:?}");
+            assert!(axes.to_rotation(axes.rotation(turn)).angle_between(turn) < 1e-7, "{axes:?}");
+            // An engine's cross product gives the torque in its axes.
+            let torque_n_m = axes.turned(v).cross(axes.turned(force_n));
+            assert!((axes.torque(v.cross(force_n)).vector() - torque_n_m).length() < 1e-15, "{axes:?}");
+        }
     }
 }

@@ -5,17 +5,18 @@ use std::io;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use palpate_client::bridge::{BridgeReport, Disable, Options, PositionOrigin, Tick, run_told};
 use palpate_client::os::Priority;
 use palpate_client::{Error, HapticDevice, Reading};
-use palpate_haptics::Device;
+use palpate_haptics::{Device, Instrument, Wrench};
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
 use crate::axes::{palpate_axes, palpate_vector};
 use crate::error::{CodedError, PALPATE_CONNECTION, PALPATE_INTERNAL, PALPATE_OK, at, at_mut, guard, palpate_result};
-use crate::options::{options_at, palpate_limits, palpate_touch_options};
+use crate::instrument::{palpate_instrument_device, palpate_instrument_reading};
+use crate::options::{TouchOptions, options_at, palpate_limits, palpate_touch_options};
 use crate::server::{CONNECTING, Connected, palpate_session};
 use crate::touch::{palpate_reading, palpate_state, state_of};
 
@@ -43,7 +44,9 @@ pub struct palpate_bridge {
     disable: Disable,
     stop: Arc<Notify>,
     task: JoinHandle<Result<BridgeReport, Error>>,
-    axes: palpate_axes,
+    pub(crate) axes: palpate_axes,
+    /// The instrument that the device leads; `None`: a single tip.
+    pub(crate) instrument: Option<Instrument>,
 }
 
 /// The priority of a loop's thread.
@@ -105,20 +108,62 @@ pub struct palpate_bridge_report {
 #[derive(Default)]
 struct LoopObservation {
     ticks: u64,
-    newest: Option<Tick>,
+    newest: Option<(Tick, TickTurn)>,
     priority: palpate_priority,
+}
+
+/// What a device of six axes adds to a tick.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct TickTurn {
+    /// The orientation of the device.
+    pub(crate) orientation: DQuat,
+    /// The angle between the jaws, rad.
+    pub(crate) jaw_rad: f64,
+    /// The torque that was written, N·m.
+    pub(crate) torque_n_m: DVec3,
 }
 
 fn seen_of(seen: &Mutex<LoopObservation>) -> MutexGuard<'_, LoopObservation> {
     seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// The functions of the caller's device.
+#[derive(Clone, Copy)]
+pub(crate) enum DeviceFunctions {
+    /// Of a device that has a position and renders a force.
+    ThreeAxes(palpate_device),
+    /// Of a device that also has an orientation and jaws, and renders a torque.
+    SixAxes(palpate_instrument_device),
+}
+
+impl DeviceFunctions {
+    /// Returns the limits that `descriptor` writes; an error if one of the functions is missing.
+    fn limits(&self) -> Result<palpate_limits, CodedError> {
+        let (user, descriptor, has_others) = match self {
+            DeviceFunctions::ThreeAxes(device) => {
+                (device.user, device.descriptor, device.read.is_some() && device.write.is_some())
+            }
+            DeviceFunctions::SixAxes(device) => {
+                (device.user, device.descriptor, device.read.is_some() && device.write.is_some())
+            }
+        };
+        let Some(descriptor) = descriptor.filter(|_| has_others) else {
+            return Err(CodedError::argument("device: all three functions must be there"));
+        };
+        let mut limits = palpate_limits::from(palpate_haptics::device::UNDECLARED);
+        // SAFETY: the caller's promise.
+        checked("descriptor", unsafe { descriptor(user, &mut limits) }).map_err(Error::Device)?;
+        Ok(limits)
+    }
+}
+
 /// The caller's functions as a haptic device.
 struct Called {
-    device: palpate_device,
+    functions: DeviceFunctions,
     limits: Device,
     axes: palpate_axes,
     ticks: u64,
+    turn: TickTurn,
     seen: Arc<Mutex<LoopObservation>>,
 }
 
@@ -135,24 +180,64 @@ impl HapticDevice for Called {
     }
 
     fn read(&mut self) -> io::Result<Reading> {
-        let mut reading = palpate_reading::default();
-        let read = self.device.read.ok_or(io::ErrorKind::InvalidInput)?;
-        // SAFETY: the caller's promise.
-        checked("read", unsafe { read(self.device.user, &mut reading) })?;
-        Ok(Reading { place_m: self.axes.to_m(reading.position), enable: reading.enable != 0 })
+        match self.functions {
+            DeviceFunctions::ThreeAxes(device) => {
+                let mut reading = palpate_reading::default();
+                let read = device.read.ok_or(io::ErrorKind::InvalidInput)?;
+                // SAFETY: the caller's promise.
+                checked("read", unsafe { read(device.user, &mut reading) })?;
+                Ok(Reading { place_m: self.axes.to_m(reading.position), enable: reading.enable != 0 })
+            }
+            DeviceFunctions::SixAxes(device) => {
+                let mut told = palpate_instrument_reading::default();
+                let read = device.read.ok_or(io::ErrorKind::InvalidInput)?;
+                // SAFETY: the caller's promise.
+                checked("read", unsafe { read(device.user, &mut told) })?;
+                let (reading, orientation, jaw_rad) = told.own(self.axes);
+                // A number that is not finite is no error, in a position either: nothing is rendered until it is.
+                if !orientation.is_finite() && self.axes.to_rotation(told.orientation).is_finite() {
+                    return Err(io::Error::other("`read` gave an orientation whose length is not 1"));
+                }
+                (self.turn.orientation, self.turn.jaw_rad) = (orientation, jaw_rad);
+                Ok(reading)
+            }
+        }
     }
 
     fn write(&mut self, force_n: DVec3) -> io::Result<()> {
-        let write = self.device.write.ok_or(io::ErrorKind::InvalidInput)?;
-        // SAFETY: the caller's promise.
-        checked("write", unsafe { write(self.device.user, &self.axes.force(force_n)) })
+        self.write_wrench(Wrench::of_force(force_n))
+    }
+
+    fn orientation(&self) -> DQuat {
+        self.turn.orientation
+    }
+
+    fn jaw_rad(&self) -> f64 {
+        self.turn.jaw_rad
+    }
+
+    fn write_wrench(&mut self, wrench: Wrench) -> io::Result<()> {
+        let force_n = self.axes.force(wrench.force_n);
+        match self.functions {
+            DeviceFunctions::ThreeAxes(device) => {
+                let write = device.write.ok_or(io::ErrorKind::InvalidInput)?;
+                // SAFETY: the caller's promise.
+                checked("write", unsafe { write(device.user, &force_n) })
+            }
+            DeviceFunctions::SixAxes(device) => {
+                let write = device.write.ok_or(io::ErrorKind::InvalidInput)?;
+                self.turn.torque_n_m = wrench.torque_n_m;
+                // SAFETY: the caller's promise.
+                checked("write", unsafe { write(device.user, &force_n, &self.axes.torque(wrench.torque_n_m)) })
+            }
+        }
     }
 
     fn ticked(&mut self, tick: &Tick) {
         self.ticks += 1;
         // A thread that reads the state must not delay a tick.
         if let Ok(mut seen) = self.seen.try_lock() {
-            (seen.ticks, seen.newest) = (self.ticks, Some(*tick));
+            (seen.ticks, seen.newest) = (self.ticks, Some((*tick, self.turn)));
         }
     }
 }
@@ -182,59 +267,79 @@ pub unsafe extern "C" fn palpate_bridge_begin(
             )
         };
         *out = std::ptr::null_mut();
-        if options.origin != PositionOrigin::Workspace {
-            return Err(CodedError::argument(
-                "in_tissue_frame is not for devices: their origin lies on the top of the tissue",
-            ));
-        }
-        let (Some(descriptor), Some(_), Some(_)) = (device.descriptor, device.read, device.write) else {
-            return Err(CodedError::argument("device: all three functions must be there"));
-        };
-        let mut limits = palpate_limits::from(palpate_haptics::device::UNDECLARED);
-        // SAFETY: the caller's promise.
-        checked("descriptor", unsafe { descriptor(device.user, &mut limits) }).map_err(Error::Device)?;
-        let seen = Arc::new(Mutex::new(LoopObservation::default()));
-        let called = Called { device, limits: limits.device()?, axes: options.axes, ticks: 0, seen: seen.clone() };
-        let shared = session.shared.clone();
-        let target = session.target(&options);
-        let told = seen.clone();
-        let begun = move |priority: &Priority| {
-            seen_of(&told).priority = match priority {
-                Priority::Usual => PALPATE_PRIORITY_USUAL,
-                Priority::RealTime => PALPATE_PRIORITY_REAL_TIME,
-                Priority::Refused(_) => PALPATE_PRIORITY_REFUSED,
-            };
-        };
-        let of_run = Options {
-            real_time: options.real_time,
-            keeps_session: true,
-            warn: options.warn,
-            copies: options.copies,
-            begun: Some(Box::new(begun)),
-            ..Options::default()
-        };
-        let disable = of_run.disable.clone();
-        let stop = Arc::new(Notify::new());
-        let stopped = stop.clone();
-        let task = shared.threads.spawn(async move {
-            let ended = run_told(called, target, of_run, async move { stopped.notified().await }).await;
-            ended.map(|(_, report)| report)
-        })?;
-        let bridge = palpate_bridge { shared, seen, disable, stop, task, axes: options.axes };
-        let until = Instant::now() + bridge.shared.timeout.min(CONNECTING);
-        while !bridge.task.is_finished() && Instant::now() < until {
-            if seen_of(&bridge.seen).newest.is_some_and(|tick| tick.state.is_some()) {
-                *out = Box::into_raw(Box::new(bridge));
-                return Ok(());
-            }
-            std::thread::sleep(Duration::from_millis(2));
-        }
-        // It never connected, so there is an error.
-        Err(bridge.end().1.unwrap_or_else(|| CodedError::new(PALPATE_CONNECTION, "the server does not answer")))
+        *out = Box::into_raw(Box::new(begin(session, DeviceFunctions::ThreeAxes(device), options)?));
+        Ok(())
     })
 }
 
+/// Connects a device to a session, and waits for the first connection.
+pub(crate) fn begin(
+    session: &palpate_session,
+    functions: DeviceFunctions,
+    options: TouchOptions,
+) -> Result<palpate_bridge, CodedError> {
+    if options.origin != PositionOrigin::Workspace {
+        return Err(CodedError::argument(
+            "in_tissue_frame is not for devices: their origin lies on the top of the tissue",
+        ));
+    }
+    let limits = functions.limits()?.device(options.device.torque_n_m)?;
+    let seen = Arc::new(Mutex::new(LoopObservation::default()));
+    let turn = TickTurn::default();
+    let called = Called { functions, limits, axes: options.axes, ticks: 0, turn, seen: seen.clone() };
+    let hand = options.hand.as_ref().map(|hand| hand.take(&session.session_id)).transpose()?;
+    let shared = session.shared.clone();
+    let target = session.target(&options);
+    let told = seen.clone();
+    let begun = move |priority: &Priority| {
+        seen_of(&told).priority = match priority {
+            Priority::Usual => PALPATE_PRIORITY_USUAL,
+            Priority::RealTime => PALPATE_PRIORITY_REAL_TIME,
+            Priority::Refused(_) => PALPATE_PRIORITY_REFUSED,
+        };
+    };
+    let of_run = Options {
+        real_time: options.real_time,
+        keeps_session: true,
+        warn: options.warn,
+        copies: options.copies,
+        hand,
+        instrument: options.instrument.clone(),
+        begun: Some(Box::new(begun)),
+        ..Options::default()
+    };
+    let disable = of_run.disable.clone();
+    let stop = Arc::new(Notify::new());
+    let stopped = stop.clone();
+    let task = shared.threads.spawn(async move {
+        let ended = run_told(called, target, of_run, async move { stopped.notified().await }).await;
+        ended.map(|(_, report)| report)
+    })?;
+    let (axes, instrument) = (options.axes, options.instrument);
+    let bridge = palpate_bridge { shared, seen, disable, stop, task, axes, instrument };
+    let until = Instant::now() + bridge.shared.timeout.min(CONNECTING);
+    while !bridge.task.is_finished() && Instant::now() < until {
+        if seen_of(&bridge.seen).newest.is_some_and(|(tick, _)| tick.state.is_some()) {
+            return Ok(bridge);
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    // It never connected, so there is an error.
+    Err(bridge.end().1.unwrap_or_else(|| CodedError::new(PALPATE_CONNECTION, "the server does not answer")))
+}
+
 impl palpate_bridge {
+    /// Returns the number of ticks, what the last one did, and the priority of the loop.
+    pub(crate) fn observed(&self) -> (u64, Option<(Tick, TickTurn)>, palpate_priority) {
+        let seen = seen_of(&self.seen);
+        (seen.ticks, seen.newest, seen.priority)
+    }
+
+    /// Returns whether the loop has ended.
+    pub(crate) fn is_over(&self) -> bool {
+        self.task.is_finished()
+    }
+
     /// Ends the loop and waits for that. Returns its results, and the error if it failed.
     fn end(self) -> (palpate_bridge_report, Option<CodedError>) {
         self.stop.notify_one();
@@ -273,15 +378,16 @@ pub unsafe extern "C" fn palpate_bridge_look(
     guard(|| {
         // SAFETY: the caller's promises.
         let (bridge, out) = unsafe { (at(bridge, "bridge is null")?, at_mut(state, "state is null")?) };
-        let seen = seen_of(&bridge.seen);
-        let state: palpate_state = state_of(seen.newest.and_then(|tick| tick.state));
+        let (ticks, newest, priority) = bridge.observed();
+        let newest = newest.map(|(tick, _)| tick);
+        let state: palpate_state = state_of(newest.and_then(|tick| tick.state));
         *out = palpate_bridge_state {
-            ticks: seen.ticks,
-            position: seen.newest.map_or_else(palpate_vector::default, |tick| bridge.axes.position(tick.place_m)),
-            force_n: seen.newest.map_or_else(palpate_vector::default, |tick| bridge.axes.force(tick.force_n)),
+            ticks,
+            position: newest.map_or_else(palpate_vector::default, |tick| bridge.axes.position(tick.place_m)),
+            force_n: newest.map_or_else(palpate_vector::default, |tick| bridge.axes.force(tick.force_n)),
             state: state as u32,
-            priority: seen.priority as u32,
-            is_over: u32::from(bridge.task.is_finished()),
+            priority: priority as u32,
+            is_over: u32::from(bridge.is_over()),
         };
         Ok(())
     })

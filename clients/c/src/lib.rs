@@ -11,6 +11,8 @@
 mod axes;
 mod bridge;
 mod error;
+mod hand;
+mod instrument;
 mod options;
 mod os;
 mod server;
@@ -22,6 +24,8 @@ use std::ffi::{CStr, c_char};
 pub use axes::*;
 pub use bridge::*;
 pub use error::*;
+pub use hand::*;
+pub use instrument::*;
 pub use options::*;
 pub use server::*;
 pub use surface::*;

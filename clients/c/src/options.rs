@@ -3,13 +3,16 @@
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
-use palpate_client::bridge::{Copies, PositionOrigin, Warn};
-use palpate_haptics::{Device, Tip, TipShape};
+use palpate_client::bridge::{Copies, HandSlot, PositionOrigin, Warn};
+use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
+use palpate_haptics::{Device, Instrument, Port, Tip, TipShape};
 use palpate_proto::{pb, touch};
 use palpate_session::journal;
 
-use crate::axes::palpate_axes;
+use crate::axes::{palpate_axes, palpate_vector};
 use crate::error::{CodedError, guard, optional_text, palpate_result, text};
+use crate::hand::palpate_hand;
 
 /// A function of the caller that gets messages for people: `user` as given beside it, and one line of text, which
 /// is valid during the call.
@@ -53,7 +56,8 @@ pub struct palpate_limits {
     pub workspace_radius_m: f64,
 }
 
-/// Options of `palpate_touch_begin`, `palpate_touch_begin_offline` and `palpate_bridge_begin`. Texts are copied.
+/// Options of `palpate_touch_begin`, `palpate_touch_begin_offline`, `palpate_bridge_begin` and
+/// `palpate_bridge_begin_instrument`. Texts are copied.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_touch_options {
@@ -97,6 +101,26 @@ pub struct palpate_touch_options {
     pub prediction: u32,
     /// How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Others touch solids alone, and do not hold.
     pub tip_shape: u32,
+    /// Length of the jaws of an instrument, which end at the device's position, m, at most 0.5; 0 (default): none. With jaws
+    /// or a shaft the device leads an instrument, by its position, orientation and jaws: a row of tips for each jaw and for
+    /// the shaft, at most 64 in all, a tip at least for each `tip_radius_m`. Each tip is a tool, with the numbers from `tool`
+    /// on (`palpate_tool_count`). Force and torque come from a copy of the tissue, also if `prediction` is 0. `grasps`,
+    /// `deadband` and `up_deadband` must be 0.
+    pub jaws_m: f64,
+    /// Length of the shaft behind the jaws, or behind the device's position, m, at most 0.5; 0 (default): none.
+    pub shaft_m: f64,
+    /// 1: the shaft slides through `port` and turns about it, as through a trocar; 0 (default): it moves freely.
+    pub has_port: u32,
+    /// The place of the port, always in the tissue's frame, in the axes of the options.
+    pub port: palpate_vector,
+    /// Distance from the tip of the instrument to its handle, m, 0.01 to 2; default 0.33. The shaft passes through the port
+    /// between both.
+    pub handle_m: f64,
+    /// Largest torque of the device, N·m, 0 to 100; 0 (default): it renders none.
+    pub max_torque_n_m: f64,
+    /// One of the two hands of `palpate_two_hands`, if your program moves two tools or instruments; null (default): this
+    /// is the only one.
+    pub hand: *const palpate_hand,
 }
 
 /// Options of `palpate_surface_open`.
@@ -172,8 +196,8 @@ impl From<Device> for palpate_limits {
 }
 
 impl palpate_limits {
-    /// Returns a device with these limits; refuses invalid ones.
-    pub(crate) fn device(&self) -> Result<Device, CodedError> {
+    /// Returns a device with these limits and a largest torque, N·m; refuses invalid ones.
+    pub(crate) fn device(&self, max_torque_n_m: f64) -> Result<Device, CodedError> {
         let message = pb::Device {
             name: "libpalpate".to_owned(),
             max_force_n: self.max_force_n,
@@ -181,7 +205,7 @@ impl palpate_limits {
             max_stiffness_n_per_m: self.max_stiffness_n_per_m,
             max_damping_n_s_per_m: self.max_damping_n_s_per_m,
             workspace_radius_m: self.workspace_radius_m,
-            max_torque_n_m: 0.0,
+            max_torque_n_m,
         };
         touch::from_device(&message).map_err(|refusal| CodedError::argument(refusal.to_string()))
     }
@@ -233,6 +257,13 @@ unsafe impl Versioned for palpate_touch_options {
             warn_user: std::ptr::null_mut(),
             prediction: 0,
             tip_shape: palpate_tip_shape::default() as u32,
+            jaws_m: 0.0,
+            shaft_m: 0.0,
+            has_port: 0,
+            port: palpate_vector::default(),
+            handle_m: DEFAULT_HANDLE_M,
+            max_torque_n_m: 0.0,
+            hand: std::ptr::null(),
         }
     }
 }
@@ -312,6 +343,16 @@ impl palpate_tip_shape {
     }
 }
 
+/// Largest length of jaws or a shaft, m.
+const MAX_PART_M: f64 = 0.5;
+
+/// Returns a value of the options if it is within its range, else an error that names it.
+fn within(name: &str, value: f64, range: std::ops::RangeInclusive<f64>) -> Result<f64, CodedError> {
+    let wrong =
+        || CodedError::argument(format!("{name} is {value}: must be from {} to {}", range.start(), range.end()));
+    if range.contains(&value) { Ok(value) } else { Err(wrong()) }
+}
+
 /// Checked options for touching.
 pub(crate) struct TouchOptions {
     pub(crate) tool: u32,
@@ -326,6 +367,16 @@ pub(crate) struct TouchOptions {
     pub(crate) holder: String,
     pub(crate) warn: Option<Warn>,
     pub(crate) copies: Option<Copies>,
+    pub(crate) instrument: Option<Instrument>,
+    pub(crate) hand: Option<HandSlot>,
+}
+
+impl TouchOptions {
+    /// Returns the number of tools that a loop with these options moves.
+    pub(crate) fn tool_count(&self) -> u32 {
+        let tips = self.instrument.as_ref().map_or(1, |instrument| instrument.tips.len());
+        u32::try_from(tips).unwrap_or(u32::MAX)
+    }
 }
 
 /// Returns the tissues to copy, by the value of `prediction` in `palpate_touch_options`.
@@ -357,14 +408,8 @@ impl TextCallback {
 
 impl palpate_touch_options {
     /// # Safety
-    /// `holder` must be null or a zero-terminated text.
+    /// `holder` must be null or a zero-terminated text, `hand` null or a hand.
     pub(crate) unsafe fn checked(&self) -> Result<TouchOptions, CodedError> {
-        let within = |name: &str, value: f64, range: std::ops::RangeInclusive<f64>| {
-            let wrong = || {
-                CodedError::argument(format!("{name} is {value}: must be from {} to {}", range.start(), range.end()))
-            };
-            if range.contains(&value) { Ok(value) } else { Err(wrong()) }
-        };
         let warn = |show| -> Warn {
             let shown = TextCallback { show, user: self.warn_user };
             Box::new(move |message| shown.show(message))
@@ -378,19 +423,69 @@ impl palpate_touch_options {
             shape: palpate_tip_shape::of(self.tip_shape)?,
             ..Tip::default()
         };
+        let axes = palpate_axes::of(self.axes)?;
+        let instrument = self.instrument(axes, tip)?;
+        // An instrument is rendered from a copy of any tissue.
+        let prediction = if instrument.is_some() { self.prediction.max(2) } else { self.prediction };
+        // SAFETY: the caller's promise.
+        let hand = unsafe { self.hand.as_ref() }.map(|hand| hand.slot.clone());
         Ok(TouchOptions {
             tool: self.tool,
-            axes: palpate_axes::of(self.axes)?,
+            axes,
             origin: if self.in_tissue_frame == 0 { PositionOrigin::Workspace } else { PositionOrigin::Tissue },
             tip,
-            device: self.limits.device()?,
+            device: self.limits.device(self.max_torque_n_m)?,
             deadband: within("deadband", self.deadband, 0.0..=1.0)?,
             up_deadband: within("up_deadband", self.up_deadband, 0.0..=1.0)?,
             datagrams: self.datagrams != 0,
             real_time: self.real_time != 0,
             holder,
             warn: self.warn.map(warn),
-            copies: copies(self.prediction)?,
+            copies: copies(prediction)?,
+            instrument,
+            hand,
         })
+    }
+
+    /// Returns the instrument of the options, with these tips; `None` for a single tip.
+    fn instrument(&self, axes: palpate_axes, tip: Tip) -> Result<Option<Instrument>, CodedError> {
+        let part = |name, length_m: f64| {
+            within(name, length_m, 0.0..=MAX_PART_M).map(|length_m| (length_m > 0.0).then_some((length_m, tip)))
+        };
+        let (jaws, shaft) = (part("jaws_m", self.jaws_m)?, part("shaft_m", self.shaft_m)?);
+        let handle_m = within("handle_m", self.handle_m, HANDLE_M)?;
+        if jaws.is_none() && shaft.is_none() {
+            return if self.has_port == 0 {
+                Ok(None)
+            } else {
+                Err(CodedError::argument("has_port: a port is for an instrument: jaws_m or shaft_m must be above 0"))
+            };
+        }
+        if tip.grasps {
+            return Err(CodedError::argument("grasps: an instrument holds the tissue between its jaws: must be 0"));
+        }
+        for (name, value) in [("deadband", self.deadband), ("up_deadband", self.up_deadband)] {
+            if value != 0.0 {
+                return Err(CodedError::argument(format!("{name} is {value}: must be 0 for an instrument")));
+            }
+        }
+        let mut instrument = Instrument::default();
+        instrument.add_parts(jaws, shaft);
+        let tips = instrument.tips.len();
+        if tips > MAX_TIPS {
+            let why = format!(
+                "jaws_m, shaft_m: the instrument has {tips} tips, above the limit of {MAX_TIPS}: rows have one for each \
+                 tip_radius_m"
+            );
+            return Err(CodedError::argument(why));
+        }
+        if self.has_port != 0 {
+            let place_m = axes.to_m(self.port);
+            if !place_m.is_finite() {
+                return Err(CodedError::argument("port must be finite"));
+            }
+            instrument.port = Some(Port { place_m, handle_m });
+        }
+        Ok(Some(instrument))
     }
 }

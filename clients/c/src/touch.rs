@@ -5,7 +5,7 @@ use std::cell::UnsafeCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use ::palpate_haptics::RenderingState;
+use ::palpate_haptics::{Instrument, RenderingState};
 use palpate_client::bridge::{self, Connection, Offline, OfflineNetwork, Options, Ticker};
 use palpate_client::{Error, Reading};
 
@@ -17,8 +17,10 @@ use crate::server::{Connected, palpate_session};
 /// A tool that your own loop moves, on a server or in a recording, from `palpate_touch_begin` or
 /// `palpate_touch_begin_offline` to `palpate_touch_end`.
 pub struct palpate_touch {
-    ticker: Exclusive<Ticker>,
-    axes: palpate_axes,
+    pub(crate) ticker: Exclusive<Ticker>,
+    pub(crate) axes: palpate_axes,
+    /// The instrument that the loop leads; `None`: a single tip.
+    pub(crate) instrument: Option<Instrument>,
     far: Far,
 }
 
@@ -152,12 +154,15 @@ pub unsafe extern "C" fn palpate_touch_begin(
         *out = std::ptr::null_mut();
         let shared = session.shared.clone();
         let target = session.target(&options);
-        let (warn, copies) = (options.warn, options.copies);
-        let of_run = Options { keeps_session: true, warn, copies, ..Options::default() };
+        let hand = options.hand.map(|hand| hand.take(&session.session_id)).transpose()?;
+        let (warn, copies, instrument) = (options.warn, options.copies, options.instrument);
+        let of_run =
+            Options { keeps_session: true, warn, copies, hand, instrument: instrument.clone(), ..Options::default() };
         let beginning = bridge::begin(target, options.device, options.origin, of_run);
         let (ticker, connection) = shared.threads.block_on(beginning)??;
         let far = Far::Server { connection, shared };
-        *out = Box::into_raw(Box::new(palpate_touch { ticker: Exclusive::new(ticker), axes: options.axes, far }));
+        let (ticker, axes) = (Exclusive::new(ticker), options.axes);
+        *out = Box::into_raw(Box::new(palpate_touch { ticker, axes, instrument, far }));
         Ok(())
     })
 }
@@ -165,7 +170,8 @@ pub unsafe extern "C" fn palpate_touch_begin(
 /// Creates a loop that renders recordings, without a server: equal messages, positions and times give equal forces,
 /// bit by bit. It has no copy of the tissue; `prediction` is ignored. `options` may be null; `middle_m` is the place
 /// in the tissue of the middle of the workspace (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for
-/// `palpate_touch_end`. Any thread.
+/// `palpate_touch_end`. Returns `PALPATE_ARGUMENT` also for an instrument and for a hand, which need a copy of the
+/// tissue. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_begin_offline(
     options: *const palpate_touch_options,
@@ -180,9 +186,18 @@ pub unsafe extern "C" fn palpate_touch_begin_offline(
         if !middle_m.is_finite() {
             return Err(CodedError::argument("middle_m must be finite"));
         }
+        if options.instrument.is_some() {
+            return Err(CodedError::argument(
+                "jaws_m, shaft_m: an instrument is rendered from a copy of the tissue, which a recording has not",
+            ));
+        }
+        if options.hand.is_some() {
+            return Err(CodedError::argument("hand: a recording has no second hand"));
+        }
         let Offline { ticker, record } = Offline::new(options.device, options.origin, middle_m, options.up_deadband);
         let far = Far::Record(Exclusive::new(record));
-        *out = Box::into_raw(Box::new(palpate_touch { ticker: Exclusive::new(ticker), axes: options.axes, far }));
+        let (ticker, axes) = (Exclusive::new(ticker), options.axes);
+        *out = Box::into_raw(Box::new(palpate_touch { ticker, axes, instrument: None, far }));
         Ok(())
     })
 }
@@ -214,7 +229,8 @@ pub unsafe extern "C" fn palpate_touch_arrive(
 
 /// Writes the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, of
 /// a clock that advances between ticks. Takes bounded time: no lock, no call of the system, no memory allocated or
-/// freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. Returns
+/// freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. An instrument is
+/// not turned, and its jaws are closed: `palpate_touch_tick_instrument` has more. Returns
 /// `PALPATE_ARGUMENT` if the position or the time is not finite: `felt` then has a force that falls to zero. After
 /// any other error, `felt` has a force of zero. One thread at a time: another gets `PALPATE_BUSY`.
 #[unsafe(no_mangle)]

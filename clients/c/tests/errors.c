@@ -2,6 +2,7 @@
 #define _POSIX_C_SOURCE 200809L
 #include <math.h>
 #include <palpate.h>
+#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -47,6 +48,164 @@ static int write_ok(void *user, const palpate_vector *force_n) {
     return 0;
 }
 
+/* A device of six axes above the tissue. Its orientation becomes wrong after a while; with `holds` it does not. */
+static int read_turned(void *user, palpate_instrument_reading *reading) {
+    reading->position.z = 0.02;
+    reading->enable = ++*(int *)user / 50 % 2;
+    reading->jaw_rad = 0.5;
+    if (!holds && *(int *)user > 2000) reading->orientation.w = 0.5;
+    return 0;
+}
+static int write_turned(void *user, const palpate_vector *force_n, const palpate_vector *torque_n_m) {
+    zero_at_end = torque_n_m->x == 0.0 && torque_n_m->y == 0.0 && torque_n_m->z == 0.0;
+    int is_zero = zero_at_end;
+    write_ok(user, force_n);
+    zero_at_end = zero_at_end && is_zero;
+    return 0;
+}
+
+/* Instruments and hands. */
+static void try_instruments(const palpate_session *session, const palpate_session *other_session) {
+    palpate_touch *touch = NULL, *second = NULL;
+    palpate_bridge *bridge = NULL;
+    palpate_touch_options options;
+    uint32_t tools = 0;
+    EXPECT(palpate_tool_count(NULL, NULL), PALPATE_ARGUMENT, "count is null");
+    EXPECT(palpate_tool_count(NULL, &tools), PALPATE_OK, NULL);
+    if (tools != 1) failures++, fprintf(stderr, "a single tip is %u tools\n", tools);
+
+    /* Each value is named. */
+    EXPECT(palpate_touch_options_init(&options, sizeof options), PALPATE_OK, NULL);
+    options.has_port = 1;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "has_port");
+    options.has_port = 0;
+    options.jaws_m = -0.01;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "jaws_m");
+    options.jaws_m = NAN;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "jaws_m");
+    options.jaws_m = 0.015;
+    options.shaft_m = INFINITY;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "shaft_m");
+    options.shaft_m = 0.5;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "tips, above the limit of 64");
+    options.shaft_m = 0.02;
+    options.tip_radius_m = 0.003;
+    options.has_port = 1;
+    options.port = (palpate_vector){0.0, NAN, 0.1};
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "port must be finite");
+    palpate_extent extent;
+    EXPECT(palpate_session_extent(session, &extent), PALPATE_OK, NULL);
+    options.port = (palpate_vector){extent.top_m.x, extent.top_m.y - 0.05, extent.top_m.z + 0.1};
+    options.handle_m = 0.0;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "handle_m");
+    options.handle_m = 0.33;
+    options.max_torque_n_m = NAN;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "max_torque_n_m");
+    options.max_torque_n_m = 0.4;
+    options.grasps = 1;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "grasps");
+    options.grasps = 0;
+    options.deadband = 0.1;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_ARGUMENT, "deadband");
+    options.deadband = 0.0;
+    EXPECT(palpate_tool_count(&options, &tools), PALPATE_OK, NULL);
+    if (tools < 8 || tools > 20) failures++, fprintf(stderr, "%u tools\n", tools);
+    EXPECT(palpate_touch_begin_offline(&options, (palpate_vector){0}, &touch), PALPATE_ARGUMENT, "jaws_m");
+    /* A structure of a header that knows no instruments has a single tip. */
+    palpate_touch_options older = options;
+    older.size = offsetof(palpate_touch_options, jaws_m);
+    EXPECT(palpate_tool_count(&older, &tools), PALPATE_OK, NULL);
+    if (tools != 1) failures++, fprintf(stderr, "an older structure has %u tools\n", tools);
+
+    /* Hands. */
+    palpate_hand *hands[2] = {NULL, NULL};
+    EXPECT(palpate_two_hands(NULL, &hands[1]), PALPATE_ARGUMENT, "left is null");
+    EXPECT(palpate_two_hands(&hands[0], NULL), PALPATE_ARGUMENT, "right is null");
+    EXPECT(palpate_two_hands(&hands[0], &hands[0]), PALPATE_ARGUMENT, "two places");
+    EXPECT(palpate_two_hands(&hands[0], &hands[1]), PALPATE_OK, NULL);
+    palpate_touch_options single;
+    EXPECT(palpate_touch_options_init(&single, sizeof single), PALPATE_OK, NULL);
+    single.hand = hands[0];
+    EXPECT(palpate_touch_begin_offline(&single, (palpate_vector){0}, &touch), PALPATE_ARGUMENT, "hand");
+    options.hand = hands[0];
+    options.in_tissue_frame = 1;
+    options.limits.workspace_radius_m = 1.0;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_OK, NULL);
+    options.hand = hands[1];
+    EXPECT(palpate_touch_begin(other_session, &options, &second), PALPATE_ARGUMENT, "another session");
+    options.hand = hands[0];
+    EXPECT(palpate_touch_begin(session, &options, &second), PALPATE_ARGUMENT, "used this hand");
+    options.hand = NULL;
+    EXPECT(palpate_touch_begin(session, &options, &second), PALPATE_REFUSED, NULL); /* The tools are held. */
+
+    /* The shaft passes through the port, whatever the device's orientation. */
+    palpate_instrument_reading reading = {{extent.top_m.x, extent.top_m.y, extent.top_m.z + 0.02}, {1.0, 0.0, 0.0, 0.0}, 0.5, 1};
+    palpate_instrument_felt felt;
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.0, NULL), PALPATE_ARGUMENT, "felt is null");
+    EXPECT(palpate_touch_tick_instrument(touch, NULL, 0.0, &felt), PALPATE_ARGUMENT, "reading is null");
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.001, &felt), PALPATE_OK, NULL);
+    palpate_quaternion q = felt.orientation;
+    double shaft[3] = {1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z), 2.0 * (q.x * q.z - q.w * q.y)};
+    double way[3] = {0.0, 0.05, -0.08}, size = sqrt(0.05 * 0.05 + 0.08 * 0.08);
+    for (int k = 0; k < 3; k++)
+        if (fabs(shaft[k] - way[k] / size) > 1e-9) failures++, fprintf(stderr, "the shaft misses the port: %g\n", shaft[k]);
+    palpate_reading plain = {reading.position, 1};
+    palpate_felt plain_felt;
+    EXPECT(palpate_touch_tick(touch, &plain, 0.002, &plain_felt), PALPATE_OK, NULL);
+    reading.orientation.w = 0.0;
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.003, &felt), PALPATE_ARGUMENT, "orientation");
+    if (felt.state != PALPATE_STATE_FAULT || felt.force_n.z != 0.0 || felt.torque_n_m.x != 0.0 || felt.orientation.w != 1.0)
+        failures++, fprintf(stderr, "wrong orientation: state %u\n", felt.state);
+    reading.orientation.w = NAN;
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.004, &felt), PALPATE_ARGUMENT, "orientation");
+    reading.orientation.w = 1.0;
+    reading.jaw_rad = NAN;
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.005, &felt), PALPATE_ARGUMENT, "jaw angle");
+    reading.jaw_rad = -1.0;
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, NAN, &felt), PALPATE_ARGUMENT, "not finite");
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.006, &felt), PALPATE_OK, NULL);
+    palpate_touch_end(touch);
+    EXPECT(palpate_touch_begin(session, &single, &touch), PALPATE_ARGUMENT, "used this hand");
+    single.hand = NULL;
+    EXPECT(palpate_touch_begin(session, &single, &touch), PALPATE_OK, NULL);
+    EXPECT(palpate_touch_tick_instrument(touch, &reading, 0.0, &felt), PALPATE_ARGUMENT, "leads no instrument");
+    palpate_touch_end(touch);
+
+    /* Devices of six axes. */
+    int reads = 0;
+    palpate_instrument_device device = {&reads, limits_ok, read_turned, NULL};
+    options.in_tissue_frame = 0;
+    EXPECT(palpate_bridge_begin_instrument(session, NULL, &options, &bridge), PALPATE_ARGUMENT, "device is null");
+    EXPECT(palpate_bridge_begin_instrument(session, &device, &options, &bridge), PALPATE_ARGUMENT, "all three");
+    device.write = write_turned;
+    EXPECT(palpate_bridge_begin_instrument(session, &device, &single, &bridge), PALPATE_ARGUMENT, "jaws_m");
+    options.hand = hands[1];
+    EXPECT(palpate_bridge_begin_instrument(session, &device, &options, &bridge), PALPATE_OK, NULL);
+    palpate_hand_free(hands[0]);
+    palpate_hand_free(hands[1]);
+    palpate_hand_free(NULL);
+    palpate_instrument_state state;
+    EXPECT(palpate_bridge_look_instrument(NULL, &state), PALPATE_ARGUMENT, "bridge is null");
+    do {
+        nanosleep(&(struct timespec){0, 1000000}, NULL);
+        EXPECT(palpate_bridge_look_instrument(bridge, &state), PALPATE_OK, NULL);
+    } while (!state.is_over);
+    if (state.ticks == 0 || state.jaw_rad != 0.5 || fabs(state.position.z - extent.top_m.z - 0.02) > 1e-9)
+        failures++, fprintf(stderr, "jaws %g, z %g\n", state.jaw_rad, state.position.z);
+    palpate_bridge_report report;
+    EXPECT(palpate_bridge_end(bridge, &report), PALPATE_DEVICE, "length is not 1");
+    if (!zero_at_end) failures++, fprintf(stderr, "a device of six axes is left with a force or torque\n");
+    /* A device of three axes leads an instrument that is not turned. */
+    palpate_device three = {&reads, limits_ok, read_asks, write_ok};
+    options.hand = NULL;
+    EXPECT(palpate_bridge_begin(session, &three, &options, &bridge), PALPATE_OK, NULL);
+    EXPECT(palpate_bridge_look_instrument(bridge, &state), PALPATE_OK, NULL);
+    EXPECT(palpate_bridge_end(bridge, NULL), PALPATE_OK, NULL);
+    EXPECT(palpate_bridge_begin(session, &three, &single, &bridge), PALPATE_OK, NULL);
+    EXPECT(palpate_bridge_look_instrument(bridge, &state), PALPATE_ARGUMENT, "leads no instrument");
+    EXPECT(palpate_bridge_end(bridge, NULL), PALPATE_OK, NULL);
+}
+
 /* Lets the bridge's thread run first, for tools that run only one thread at a time. */
 static void look_later(const palpate_bridge *bridge, palpate_bridge_state *state) {
     nanosleep(&(struct timespec){0, 1000000}, NULL);
@@ -78,6 +237,8 @@ int main(int count, char **arguments) {
     EXPECT(palpate_touch_arrive(NULL, NULL, 0), PALPATE_ARGUMENT, "touch is null");
     EXPECT(palpate_touch_traffic(NULL, NULL), PALPATE_ARGUMENT, "touch is null");
     EXPECT(palpate_bridge_begin(NULL, NULL, NULL, &bridge), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_bridge_begin_instrument(NULL, NULL, NULL, &bridge), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_touch_tick_instrument(NULL, NULL, 0.0, NULL), PALPATE_ARGUMENT, "felt is null");
     EXPECT(palpate_bridge_look(NULL, NULL), PALPATE_ARGUMENT, "bridge is null");
     EXPECT(palpate_bridge_end(NULL, NULL), PALPATE_ARGUMENT, "bridge is null");
     EXPECT(palpate_surface_open(NULL, NULL, &surface), PALPATE_ARGUMENT, "session is null");
@@ -284,6 +445,12 @@ int main(int count, char **arguments) {
     while (state.state != PALPATE_STATE_ENABLED && !state.is_over);
     EXPECT(palpate_bridge_end(bridge, &report), PALPATE_OK, NULL);
     if (report.result != PALPATE_OK) failures++, fprintf(stderr, "result %u\n", report.result);
+
+    palpate_session *another = NULL;
+    EXPECT(palpate_session_create(server, "paper", &another), PALPATE_OK, NULL);
+    try_instruments(session, another);
+    EXPECT(palpate_session_delete(another), PALPATE_OK, NULL);
+    palpate_session_free(another);
 
     /* A deleted session no longer exists; handles remain usable, in any order. */
     EXPECT(palpate_session_delete(session), PALPATE_OK, NULL);

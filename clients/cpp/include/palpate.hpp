@@ -5,6 +5,7 @@
 
 #include <palpate.h>
 
+#include <array>
 #include <cstdint>
 #include <memory>
 #include <optional>
@@ -16,9 +17,12 @@
 namespace palpate {
 
 using Vector = palpate_vector;
+using Quaternion = palpate_quaternion;
 using Extent = palpate_extent;
 using Reading = palpate_reading;
 using Felt = palpate_felt;
+using InstrumentReading = palpate_instrument_reading;
+using InstrumentFelt = palpate_instrument_felt;
 using Limits = palpate_limits;
 using Traffic = palpate_traffic;
 using Report = palpate_bridge_report;
@@ -76,6 +80,29 @@ Result<std::string> text(Write write) {
 /// Options for touching. The fields are those of palpate_touch_options.
 struct TouchOptions : palpate_touch_options {
     TouchOptions() { palpate_touch_options_init(this, sizeof(palpate_touch_options)); }
+    /// Returns how many tools a loop with these options moves: one for each tip of an instrument.
+    Result<std::uint32_t> tool_count() const {
+        std::uint32_t count = 0;
+        if (auto code = palpate_tool_count(this, &count)) return detail::error(code);
+        return count;
+    }
+};
+
+/// One of the two hands of a program, for `hand` of TouchOptions; see palpate_two_hands.
+class Hand {
+public:
+    /// Returns the two hands of a program.
+    static Result<std::array<Hand, 2>> two() {
+        palpate_hand *left = nullptr, *right = nullptr;
+        if (auto code = palpate_two_hands(&left, &right)) return detail::error(code);
+        return std::array<Hand, 2>{Hand(left), Hand(right)};
+    }
+    /// Returns the handle, which is valid as long as this object.
+    const palpate_hand* get() const { return hand_.get(); }
+    explicit Hand(palpate_hand* hand) : hand_(hand) {}
+
+private:
+    detail::Handle<palpate_hand, palpate_hand_free> hand_;
 };
 
 /// Options for a surface. The fields are those of palpate_surface_options.
@@ -101,6 +128,13 @@ public:
     Felt tick(const Reading& reading, double time_s) noexcept {
         Felt felt{};
         palpate_touch_tick(touch_.get(), &reading, time_s, &felt);
+        return felt;
+    }
+    /// Returns force and torque until the next tick, for options with an instrument. The rules are those of the other
+    /// tick.
+    InstrumentFelt tick(const InstrumentReading& reading, double time_s) noexcept {
+        InstrumentFelt felt{};
+        palpate_touch_tick_instrument(touch_.get(), &reading, time_s, &felt);
         return felt;
     }
     /// Stops rendering until `enable` goes from 0 to 1 again.
@@ -157,6 +191,36 @@ public:
     }
 };
 
+/// A device of your own with six axes, which leads an instrument: derive from this class. A thread of the library calls it
+/// a thousand times a second.
+class InstrumentDevice {
+public:
+    virtual ~InstrumentDevice() = default;
+    /// Returns the limits of the device. The largest torque is `max_torque_n_m` of the options.
+    virtual Limits limits() = 0;
+    /// Reads the state of the device; false if it fails. The orientation is not turned before the call.
+    virtual bool read(InstrumentReading& reading) = 0;
+    /// Renders a force and a torque until the next tick, N and N·m; false if it fails.
+    virtual bool write(const Vector& force_n, const Vector& torque_n_m) = 0;
+
+    /// Returns the device in the form that the library expects.
+    palpate_instrument_device called() {
+        palpate_instrument_device device{};
+        device.user = this;
+        device.descriptor = [](void* user, palpate_limits* limits) noexcept {
+            *limits = static_cast<InstrumentDevice*>(user)->limits();
+            return 0;
+        };
+        device.read = [](void* user, palpate_instrument_reading* reading) noexcept {
+            return static_cast<InstrumentDevice*>(user)->read(*reading) ? 0 : 1;
+        };
+        device.write = [](void* user, const palpate_vector* force_n, const palpate_vector* torque_n_m) noexcept {
+            return static_cast<InstrumentDevice*>(user)->write(*force_n, *torque_n_m) ? 0 : 1;
+        };
+        return device;
+    }
+};
+
 /// The loop that drives a device, on a thread of the library. It ends when this object is destroyed.
 class Bridge {
 public:
@@ -164,6 +228,12 @@ public:
     palpate_bridge_state look() const noexcept {
         palpate_bridge_state state{};
         palpate_bridge_look(bridge_.get(), &state);
+        return state;
+    }
+    /// Returns where the instrument is and what is rendered; zeros if the device leads none.
+    palpate_instrument_state look_instrument() const noexcept {
+        palpate_instrument_state state{};
+        palpate_bridge_look_instrument(bridge_.get(), &state);
         return state;
     }
     /// Stops rendering until `enable` goes from 0 to 1 again. Can be called on any thread.
@@ -254,6 +324,15 @@ public:
         palpate_bridge* bridge = nullptr;
         const palpate_device called = device.called();
         if (auto code = palpate_bridge_begin(session_.get(), &called, &options, &bridge)) return detail::error(code);
+        return Bridge(bridge);
+    }
+    /// Connects a device of six axes, which must outlive the bridge. The options need `jaws_m` or `shaft_m`. Waits for the
+    /// server.
+    Result<Bridge> bridge(InstrumentDevice& device, const TouchOptions& options) const {
+        palpate_bridge* bridge = nullptr;
+        const palpate_instrument_device called = device.called();
+        auto code = palpate_bridge_begin_instrument(session_.get(), &called, &options, &bridge);
+        if (code) return detail::error(code);
         return Bridge(bridge);
     }
     /// Gets the surface. Waits for the server.

@@ -24,6 +24,62 @@ static class Errors
         public void Write(Vector force) { }
     }
 
+    /// Turns by a wrong length after a while.
+    class Turning : IInstrumentDevice
+    {
+        public int Reads;
+        public Vector LastForce = new Vector(1, 1, 1), LastTorque = new Vector(1, 1, 1);
+        public Limits Limits { get { return Limits.Of("sigma7"); } }
+        public InstrumentReading Read()
+        {
+            return new InstrumentReading(new Vector(0, 0, 0.02), new Orientation(++Reads > 2000 ? 0.5 : 1.0, 0, 0, 0), 0.5, true);
+        }
+        public void Write(Vector force, Vector torque) { LastForce = force; LastTorque = torque; }
+    }
+
+    static void TryInstruments(Session session)
+    {
+        var options = TouchOptions.Default;
+        if (options.Handle != 0.33 || options.HasPort || options.ToolCount != 1) failures++;
+        options.Jaws = double.NaN;
+        Expect(Code.Argument, "jaws_m", () => Console.Write(options.ToolCount));
+        options.Jaws = 0.015;
+        options.Handle = 9.0;
+        Expect(Code.Argument, "handle_m", () => Console.Write(options.ToolCount));
+        options.Handle = 0.33;
+        options.MaxTorque = 0.4;
+        options.InTissueFrame = true;
+        options.Limits.WorkspaceRadius = 1.0;
+        options.HasPort = true;
+        var top = session.Extent.Top;
+        options.Port = new Vector(top.X, top.Y - 0.05, top.Z + 0.1);
+        var hands = Hand.Two();
+        using (var touch = session.Touch(options, hands[0]))
+        {
+            Expect(Code.Argument, "used this hand", () => session.Touch(options, hands[0]));
+            // The shaft passes through the port.
+            var reading = new InstrumentReading(new Vector(top.X, top.Y, top.Z + 0.02), Orientation.Identity, 0.5, true);
+            var q = touch.Tick(reading, 0.001).Orientation;
+            double size = Math.Sqrt(0.05 * 0.05 + 0.08 * 0.08);
+            if (Math.Abs(1 - 2 * (q.Y * q.Y + q.Z * q.Z)) > 1e-9 || Math.Abs(2 * (q.X * q.Y + q.W * q.Z) - 0.05 / size) > 1e-9) failures++;
+            reading.Orientation = default(Orientation);
+            if (touch.Tick(reading, 0.002).State != State.Fault) failures++;
+        }
+        options.InTissueFrame = false;
+        var device = new Turning();
+        var bridge = session.Bridge(device, options, hands[1]);
+        while (!bridge.LookInstrument().IsOver) System.Threading.Thread.Sleep(10);
+        if (bridge.LookInstrument().JawAngle != 0.5) failures++;
+        Expect(Code.Device, "length is not 1", () => bridge.End());
+        if (device.LastForce.Length != 0 || device.LastTorque.Length != 0) failures++;
+        hands[0].Dispose();
+        bool isRefused = false;
+        try { session.Touch(options, hands[0]); } catch (ObjectDisposedException) { isRefused = true; }
+        if (!isRefused) failures++;
+        hands[1].Dispose();
+        Expect(Code.Argument, "jaws_m", () => session.Bridge(new Turning(), TouchOptions.Default));
+    }
+
     static int Main(string[] arguments)
     {
         Expect(Code.Argument, "must begin with", () => new Server("ftp://nowhere"));
@@ -67,6 +123,7 @@ static class Errors
                 var report = default(Report);
                 Expect(Code.Device, "the cable is out", () => bridge.End(out report));
                 if (report.Result != Code.Device || report.Ticks == 0 || report.Connections == 0) failures++;
+                TryInstruments(session);
                 session.Delete();
                 Expect(Code.Refused, "", () => session.Touch(TouchOptions.Default));
             }
