@@ -17,6 +17,7 @@ from ._errors import Disconnected, Error, Failed, Refused
 from ._journal import Commands, Verdict
 from ._native import (
     Frames,
+    Hand,
     Instrument,
     Journal,
     Offline,
@@ -33,6 +34,7 @@ from ._native import (
     scenes,
     scripts,
     study,
+    two_hands,
 )
 from ._native import Server as Client
 from ._run import Run
@@ -47,6 +49,7 @@ __all__ = [
     "Failed",
     "Frame",
     "Frames",
+    "Hand",
     "Instrument",
     "Journal",
     "Offline",
@@ -73,6 +76,7 @@ __all__ = [
     "scenes",
     "scripts",
     "study",
+    "two_hands",
 ]
 
 

@@ -172,6 +172,9 @@ class Instrument:
     def tips(self) -> int:
         """The number of tips: each is a tool of the session."""
 
+class Hand:
+    """One of the two hands of a program, from `two_hands`."""
+
 class Session:
     """A simulated tissue. A tool's command acts from the next step on, until its next command. Several threads may use one
     session; the interpreter's lock is released while it steps."""
@@ -379,6 +382,7 @@ class RemoteSession:
         holder: str = "python",
         remember: bool = True,
         instrument: Optional[Instrument] = None,
+        hand: Optional[Hand] = None,
     ) -> Touched:
         """Touches with a device at 1 kHz, on a thread of its own, with rendered forces within the safety envelope.
 
@@ -391,6 +395,9 @@ class RemoteSession:
         With `instrument` the device leads it, and its tips are the tools from `tool` on: `read()` also returns the
         orientation (w, x, y, z) of the device and the angle between the jaws, rad, and `write(force_n, torque_n_m)` gets the
         torque about the device's place, within `torque_n_m` of `limits`. Force and torque come from a copy of the tissue.
+
+        With `hand`, one of `two_hands`, another call touches the same session with the other hand, and each copy of the tissue
+        has the tools of both at once. `prediction` must allow a copy: "always" for single tips on a sheet.
         """
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
         """Moves a tool with a tip to `place_m` by the end of the next step; acquires the tool first if needed. It stays there
@@ -488,5 +495,10 @@ def scenes(folder: Source = "scenes") -> list[str]:
     """Returns the names of the built-in scenes, and of those in a folder."""
 def scripts(folder: Source = "scripts") -> list[str]:
     """Returns the names of the built-in scripts, and of those in a folder."""
+def two_hands() -> tuple[Hand, Hand]:
+    """Returns the two hands of a program, for `hand` of two calls of `RemoteSession.touch` in one session, at the same time: on two
+    threads, or with asyncio. Each copy of the tissue then has the tools of the other hand at once, without the delay of the
+    network. Each hand serves one call."""
+
 def devices() -> list[str]:
     """Returns the names of the devices whose limits are known."""

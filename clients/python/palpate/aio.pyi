@@ -2,7 +2,7 @@ from collections.abc import AsyncIterator
 from os import PathLike
 from typing import Any, Literal, Optional, Union
 
-from . import Frame, Instrument, Point, Run, Sampled, Scene, Script, Source, Tip, Touched, Vector
+from . import Frame, Hand, Instrument, Point, Run, Sampled, Scene, Script, Source, Tip, Touched, Vector
 
 class Samples(AsyncIterator[dict[str, Any]]):
     async def take(self, count: int) -> Sampled: ...
@@ -48,6 +48,7 @@ class RemoteSession:
         holder: str = "python",
         remember: bool = True,
         instrument: Optional[Instrument] = None,
+        hand: Optional[Hand] = None,
     ) -> Touched: ...
     async def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None: ...
     async def push(

@@ -22,6 +22,7 @@ use tokio::sync::{Mutex, oneshot};
 use crate::arrays::vector;
 use crate::device::Given;
 use crate::error::{of_client, of_status, refused, wrong};
+use crate::hand::Hand;
 use crate::held::Held;
 use crate::instrument::Instrument;
 use crate::load::load;
@@ -390,8 +391,11 @@ impl RemoteSession {
     /// orientation (w, x, y, z) of the device and the angle between the jaws, rad, and `write(force_n, torque_n_m)` gets
     /// the torque about the device's place, within `torque_n_m` of `limits`. Force and torque come from a copy of the
     /// tissue.
+    ///
+    /// With `hand`, one of `two_hands`, another call touches the same session with the other hand, and each copy of the
+    /// tissue has the tools of both at once. `prediction` must allow a copy: "always" for single tips on a sheet.
     #[pyo3(signature = (device, *, seconds=None, tool=0, tip=None, deadband=0.0, up_deadband=0.0, datagrams=true,
-        prediction="auto", holder="python", remember=true, instrument=None))]
+        prediction="auto", holder="python", remember=true, instrument=None, hand=None))]
     #[allow(clippy::too_many_arguments)]
     fn touch<'py>(
         &self,
@@ -407,6 +411,7 @@ impl RemoteSession {
         holder: &str,
         remember: bool,
         instrument: Option<Instrument>,
+        hand: Option<Hand>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let of_grids = match prediction {
             "always" => Some(true),
@@ -433,8 +438,9 @@ impl RemoteSession {
             datagrams,
             holder: holder.to_owned(),
         };
+        let hand = hand.map(|hand| hand.0.take(self.session.session_id())).transpose().map_err(of_client)?;
         let options =
-            Options { lasts, remembers: remember, keeps_session: true, copies, instrument, ..Options::default() };
+            Options { lasts, remembers: remember, keeps_session: true, copies, hand, instrument, ..Options::default() };
         let (end, ended) = oneshot::channel();
         let held = self.held.clone();
         answer_in_order(py, self.awaited, Some(end), async move {

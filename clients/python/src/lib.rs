@@ -15,6 +15,7 @@ mod client;
 mod device;
 mod ending;
 mod error;
+mod hand;
 mod held;
 mod instrument;
 mod journal;
@@ -42,6 +43,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<session::Session>()?;
     module.add_class::<tip::Tip>()?;
     module.add_class::<instrument::Instrument>()?;
+    module.add_class::<hand::Hand>()?;
     module.add_class::<journal::Journal>()?;
     module.add_class::<client::Server>()?;
     module.add_class::<client::RemoteSession>()?;
@@ -53,5 +55,6 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(run::run, module)?)?;
     module.add_function(wrap_pyfunction!(run::study, module)?)?;
     module.add_function(wrap_pyfunction!(device::devices, module)?)?;
+    module.add_function(wrap_pyfunction!(hand::two_hands, module)?)?;
     Ok(())
 }

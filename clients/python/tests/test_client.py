@@ -237,6 +237,33 @@ class Clients(Served, unittest.TestCase):
             with self.assertRaisesRegex(palpate.Refused, names):
                 palpate.Instrument(**wrong)
 
+    def test_two_hands_lead_an_instrument_each_and_serve_once(self):
+        instrument = palpate.Instrument(jaws_m=0.012, shaft_m=0.008, tip=palpate.Tip(0.004))
+
+        async def touch_with_both():
+            server = await palpate.aio.connect(self.url)
+            async with await server.create_session("liver") as session:
+                for _ in range(20):
+                    hands = palpate.two_hands()
+                    handles = [Handle(), Handle((0.0, 0.0, 0.0, 1.0))]
+                    calls = [
+                        session.touch(handles[number], seconds=3.0, instrument=instrument, tool=number * instrument.tips, hand=hand)
+                        for number, hand in enumerate(hands)
+                    ]
+                    touched = await asyncio.gather(*calls)
+                    if all(max(force[2] for force in handle.forces) > 0.05 for handle in handles):
+                        break
+                for one, handle in zip(touched, handles):
+                    self.assertGreater(one.largest_torque_n_m, 1e-4)
+                    self.assertGreater(max(force[2] for force in handle.forces), 0.05)
+                with self.assertRaisesRegex(palpate.Refused, "used this hand"):
+                    await session.touch(Handle(), seconds=1.0, instrument=instrument, hand=hands[0])
+                async with await server.create_session("paper") as other:
+                    with self.assertRaisesRegex(palpate.Refused, "another session"):
+                        await other.touch(Handle(), seconds=1.0, instrument=instrument, hand=hands[1])
+
+        asyncio.run(touch_with_both())
+
     def test_an_exception_of_a_device_comes_back_as_itself(self):
         hand = Hand(fails_at=200)
         with palpate.connect(self.url).create_session("liver") as session:
