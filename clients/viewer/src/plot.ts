@@ -116,12 +116,12 @@ class Plot {
       pen.lineWidth = 1.75;
       pen.lineJoin = "round";
       pen.beginPath();
-      let before = -Infinity;
+      let before: Moment | undefined;
       for (const moment of history) {
-        // A gap without samples gets no line.
-        if (moment.timeS - before > 0.5) pen.moveTo(x(moment.timeS), y(of(moment)));
+        // A gap without samples, or a change to another tool, gets no line.
+        if (moment.tool !== before?.tool || moment.timeS - before.timeS > 0.5) pen.moveTo(x(moment.timeS), y(of(moment)));
         else pen.lineTo(x(moment.timeS), y(of(moment)));
-        before = moment.timeS;
+        before = moment;
       }
       pen.stroke();
     }

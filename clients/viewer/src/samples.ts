@@ -32,6 +32,8 @@ export interface Told {
 
 /** One moment in the plots. */
 export interface Moment extends Told {
+  /** The tool that is told of. */
+  tool: number;
   timeS: number;
   displacementM: Vec3;
 }
@@ -69,8 +71,8 @@ export class Samples {
   tools: Felt[] = [];
   readonly history: Moment[] = [];
   onSample: (sample: Sample) => void = () => {};
-  /** The tools in the newest sample that contained all tools. */
-  private all: ToolSample[] = [];
+  /** The newest sample of each tool, and its step: datagrams bring those of one hand's tools only. */
+  private readonly latest = new Map<number, { step: bigint; sample: ToolSample }>();
 
   /** Forces of the tissue on a tool that are worth showing are at least about a hundredth of `pointN`. */
   constructor(
@@ -103,24 +105,33 @@ export class Samples {
     onFailure: (failure: Failure, waitMs: number) => void,
   ): Promise<void> {
     const take = (sample: Sample) => {
-      this.all = sample.tools;
-      this.take(sample, sample.tools);
+      const present = new Set(sample.tools.slice(0, MAX_TOOLS).map(({ tool }) => tool));
+      for (const [tool, { step }] of this.latest) if (step <= sample.step && !present.has(tool)) this.latest.delete(tool);
+      this.takeOwn(sample);
     };
     return watchSamples(server, sessionId, sampleEvery(stepRateHz), take, signal, onFailure);
   }
 
-  /** Adds a sample of this page's own tool, which arrived by datagram. */
+  /** Adds a sample that may lack tools, such as one of this page's own tools, which arrived by datagram. */
   takeOwn(sample: Sample): void {
-    const isOwn = ({ tool }: ToolSample) => sample.tools.some((own) => own.tool === tool);
-    this.take(sample, [...sample.tools, ...this.all.filter((tool) => !isOwn(tool))]);
+    const { step, tools } = sample;
+    for (const tool of tools.slice(0, MAX_TOOLS)) {
+      const known = this.latest.get(tool.tool);
+      if (known ? known.step <= step : this.latest.size < MAX_TOOLS) this.latest.set(tool.tool, { step, sample: tool });
+    }
+    this.take(sample);
   }
 
-  /** Adds a sample, unless a newer one already arrived by the other transport. */
-  private take(sample: Sample, tools: ToolSample[]): void {
+  /** The newest sample of each tool, in the order of their numbers. */
+  get toolSamples(): ToolSample[] {
+    return [...this.latest.values()].map(({ sample }) => sample).sort((a, b) => a.tool - b.tool);
+  }
+
+  /** Shows a sample, unless a newer one already arrived by the other transport. */
+  private take(sample: Sample): void {
     if (!Number.isFinite(sample.simulationTimeS) || (this.newest && sample.step < this.newest.step)) return;
     this.newest = sample;
-    const each = tools
-      .slice(0, MAX_TOOLS)
+    const each = this.toolSamples
       .filter((tool) => tool.point !== undefined || tool.vertex !== undefined)
       .map((tool) => ({
         tool: tool.tool,
@@ -138,7 +149,7 @@ export class Samples {
     const first = this.tools[0] ?? felt[0];
     // The same step may arrive by both transports.
     if (this.history.at(-1)?.timeS === timeS) this.history.pop();
-    if (first) this.history.push({ timeS, displacementM: first.displacementM, ...this.tell(first) });
+    if (first) this.history.push({ tool: first.tool, timeS, displacementM: first.displacementM, ...this.tell(first) });
     // A gap of a second or more stays visible. Older samples are dropped.
     const isOld = ({ timeS: thenS }: Moment) => !(thenS > timeS - HISTORY_S && thenS <= timeS);
     while (this.history.length > MAX_MOMENTS || (this.history[0] && isOld(this.history[0]))) this.history.shift();
