@@ -17,9 +17,11 @@ export type Action = NonNullable<Command["action"]>;
 
 /**
  * What a tool should do now: move its tip, of several tools that of each; or another action, which only a single tool
- * can do. `isMoving`: this changes with time, without a call of `changed`.
+ * can do. `isMoving`: this changes with time, without a call of `changed`. `stays`: tips stay where they are for long, so that
+ * they are commanded by calls, which need not be as frequent as datagrams: a browser that stands still for a second does not
+ * end the touch.
  */
-export type Wanted = ({ leads: readonly Lead[] } | { action: Action }) & { isMoving?: boolean };
+export type Wanted = ({ leads: readonly Lead[] } | { action: Action }) & { isMoving?: boolean; stays?: boolean };
 
 /** In the tissue's time, without a newer command: a page that vanishes does not keep pressing. */
 const TIME_TO_LIVE_S = 2;
@@ -245,7 +247,7 @@ export class Tool {
     const now = performance.now();
     if (this.isActing && this.from === undefined && now - this.sentMs > MAX_SILENCE_MS) return this.beginAnew();
     const wanted = this.wanted?.(now);
-    if (wanted && "leads" in wanted && this.datagrams.carries) return this.leadOn(wanted.leads, now);
+    if (wanted && "leads" in wanted && this.datagrams.carries && !wanted.stays) return this.leadOn(wanted.leads, now);
     if (this.underWay >= IN_FLIGHT || now < this.waitsUntilMs) return;
     const isRest = !wanted && this.released;
     if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
