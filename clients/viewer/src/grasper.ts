@@ -66,6 +66,8 @@ export class Grasper {
   private grippedM: Vec3 | undefined;
   /** Tips that hold the tissue, and those that felt it last, the strongest force first. */
   private readonly held = new Set<number>();
+  /** Whether it held tissue before the touch began anew, and does not yet hold it again. */
+  private hasLost = false;
   private feeling: number[] = [];
   private shaft: Vec3 = [0, 0, 1];
   private across: Vec3 = [1, 0, 0];
@@ -130,6 +132,7 @@ export class Grasper {
     this.across = norm(across) > 1e-3 ? unit(across) : right;
     [this.endsM, this.grippedM, this.pose] = [undefined, undefined, undefined];
     this.held.clear();
+    this.hasLost = false;
     this.feeling = [];
     // Jaws that were left closed open.
     if (this.isGripping) this.wantedRad = OPEN_RAD;
@@ -146,10 +149,10 @@ export class Grasper {
     const passedS = Math.min(Math.max(now - this.posedMs, 0), 50) / 1000;
     this.posedMs = now;
     this.outward = outward;
-    // A touch that begins anew grips anew, in the tissue.
+    // A touch that begins anew grips anew, in the tissue, and moves on once it holds it.
     this.grippedM = this.grips && hasSunk ? (this.grippedM ?? this.endsM) : undefined;
     const restingM = plus(restM, outward, outM);
-    const targetM = this.grippedM ? plus(this.grippedM, leanM) : restingM;
+    const targetM = this.grippedM ? plus(this.grippedM, leanM, this.hasLost ? 0 : 1) : restingM;
     const way = plus(targetM, this.endsM ?? targetM, -1);
     const part = this.endsM ? Math.min(1, (LENGTHS_PER_S * this.reach.lengthM * passedS) / (norm(way) || 1)) : 1;
     const endsM = (this.endsM = plus(targetM, way, part - 1));
@@ -168,6 +171,8 @@ export class Grasper {
 
   /** Lets the discs at the ends hold what they touch, from when the jaws begin to close. */
   private hold(): void {
+    if (!this.grips) this.hasLost = false;
+    else if (this.held.size > 0) this.hasLost = !this.grippedM;
     if (!this.grippedM) this.held.clear();
     else for (const tip of this.feeling) if (this.isEnd(tip) && this.held.size < this.mostHeld) this.held.add(tip);
   }
