@@ -1,9 +1,10 @@
 // The grasper as drawn: a shaft, two jaws with teeth that turn about a hinge, and the force on it.
 
 import { BoxGeometry, CapsuleGeometry, CylinderGeometry, Group, Mesh, SphereGeometry, Vector3 } from "three";
+import type { InstrumentPose } from "palpate";
 import { ForceArrow } from "./force-arrow";
 import { DRAWN_RADIUS, JAW, type ShownGrasper } from "./grasper";
-import { light, Steel } from "./material";
+import { light, SHADOWS, Steel } from "./material";
 import type { Surface } from "./surface";
 
 /** Length of the shaft, relative to the tissue's size. */
@@ -23,6 +24,13 @@ function jaw(steel: Steel): Group {
     group.add(new Mesh(new BoxGeometry(0.22, 0.22, 0.7).rotateZ(Math.PI / 4).translate(x, 0.12, 0), steel));
   }
   return group;
+}
+
+/** Returns whether a grasper looks the same in both poses. */
+export function isSamePose(a: InstrumentPose, b: InstrumentPose): boolean {
+  const { w, x, y, z } = b.orientation;
+  const turned = a.orientation.w === w && a.orientation.x === x && a.orientation.y === y && a.orientation.z === z;
+  return turned && a.jawRad === b.jawRad && a.positionM.every((v, c) => v === b.positionM[c]);
 }
 
 export class GrasperMark {
@@ -51,8 +59,8 @@ export class GrasperMark {
     this.group.visible = false;
   }
 
-  /** Puts the grasper at its pose, after the marks of the other tools. `size` is the tissue's, m. */
-  show({ pose, radiusM, liftM, forceN, part }: ShownGrasper, surface: Surface, size: number): void {
+  /** Puts the grasper at its pose. `size` is the tissue's, m; the first tools by `index` cast shadows. */
+  show({ pose, radiusM, liftM, forceN, part }: ShownGrasper, surface: Surface, size: number, index: number): void {
     this.group.visible = true;
     const { w, x, y, z } = pose.orientation;
     this.body.position.set(...pose.positionM).add(this.farM.set(...liftM));
@@ -68,9 +76,10 @@ export class GrasperMark {
     this.body.updateMatrixWorld();
     this.body.localToWorld(this.endsM.set(JAW.length * (Math.cos(pose.jawRad / 2) - 1), 0, 0));
     this.arrow.show(this.endsM, forceN, part, surface, radiusM, size);
+    if (index >= SHADOWS) return;
     // Of its shadow, only the part of the shaft is the same as that of a probe.
-    light.tips.value[0]!.set(this.endsM.x, this.endsM.y, this.endsM.z, radiusM);
+    light.tips.value[index]!.set(this.endsM.x, this.endsM.y, this.endsM.z, radiusM);
     this.body.localToWorld(this.farM.set(-long, 0, 0));
-    light.shafts.value[0]!.set(this.farM.x, this.farM.y, this.farM.z, SHAFT * radiusM);
+    light.shafts.value[index]!.set(this.farM.x, this.farM.y, this.farM.z, SHAFT * radiusM);
   }
 }

@@ -1,4 +1,4 @@
-// The grasper: an instrument of two jaws that the hand leads. Its jaws meet the tissue at the place under the pointer,
+// The grasper: an instrument of two jaws that a hand leads. Its jaws meet the tissue at the place under the pointer,
 // and its shaft points out of the tissue and towards the user.
 //
 // Open jaws glide along the tissue at a depth, as a tip does. Jaws that close hold what is between them, and move with
@@ -42,6 +42,8 @@ export interface View {
 
 /** The grasper as drawn. */
 export interface ShownGrasper {
+  /** Number of its first tool. */
+  tool: number;
   pose: InstrumentPose;
   /** Radius of its tips, m. */
   radiusM: number;
@@ -82,10 +84,11 @@ export class Grasper {
     name: string,
     private readonly reach: Reach,
     sampleEverySteps: number,
+    firstTool: number,
   ) {
     this.radiusM = TIP * reach.lengthM;
     this.jawM = JAW.length * this.radiusM;
-    this.tool = new InstrumentTool(server, sessionId, name, this.instrument(), sampleEverySteps);
+    this.tool = new InstrumentTool(server, sessionId, name, this.instrument(), sampleEverySteps, firstTool);
   }
 
   /** Returns jaws that end at the origin. */
@@ -213,6 +216,6 @@ export class Grasper {
     if (!this.pose || !this.tool.touches) return undefined;
     const { pose, radiusM } = this;
     const liftM = plus([0, 0, 0], this.outward, DRAWN_RADIUS * radiusM);
-    return { pose, radiusM, liftM, forceN, part };
+    return { tool: this.tool.tool, pose, radiusM, liftM, forceN, part };
   }
 }

@@ -1,11 +1,11 @@
-// The hand: a tool (of the package `palpate`) that is controlled by mouse, finger or keys.
+// A hand: a tool (of the package `palpate`) that is controlled by mouse, finger or keys. The page has two (hands.ts).
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
 // stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and moves it with
 // the drag. A tip is held at a depth, and glides. A grasper (grasper.ts) has several tools. A place has a side on which
-// it is touched, and pushes go into the tissue from there.
+// it is touched, and pushes go into the tissue from there. A parked tool stays where it is, as a held instrument does.
 
-import { type Action, type Lead, Tool, type Vec3, type Wanted } from "palpate";
+import { type Action, type Lead, plus, Tool, type Vec3, type Wanted } from "palpate";
 import { type Sample, type TipShape } from "palpate/v1";
 import { Grasper, type View } from "./grasper";
 import { server } from "./server";
@@ -50,17 +50,19 @@ export class Hand {
   private leanM: Vec3 = [0, 0, 0];
   /** Time from which the tip moves down; undefined while the server does not act on this touch. */
   private sinksFromMs: number | undefined;
+  private isLeft = false;
 
+  /** The hand has the tool `firstTool` of the session, and a grasper those after it, too. */
   constructor(
     sessionId: string,
     name: string,
     readonly reach: Reach,
     private readonly surface: () => Surface,
     sampleEverySteps: number,
+    firstTool: number,
   ) {
-    // All pages use the same tool, and a grasper those after it, too.
-    this.single = new Tool(server, sessionId, name, sampleEverySteps);
-    this.grasper = new Grasper(sessionId, name, reach, sampleEverySteps);
+    this.single = new Tool(server, sessionId, name, sampleEverySteps, firstTool);
+    this.grasper = new Grasper(sessionId, name, reach, sampleEverySteps, firstTool);
     for (const tool of [this.single, this.grasper.tool]) {
       tool.onChange = () => this.onChange();
       tool.onRefused = (message, reason) => this.onRefused(message, reason);
@@ -80,6 +82,7 @@ export class Hand {
   /** Chooses another mode, which ends a touch. */
   set mode(mode: Mode) {
     const former = this.tool;
+    this.isLeft = false;
     former.rest();
     this.chosen = mode;
     if (former !== this.tool) this.tool.takeAfter(former.letGo());
@@ -96,6 +99,32 @@ export class Hand {
 
   get touches(): boolean {
     return this.tool.touches;
+  }
+
+  /** Whether the tool stays where it is although nothing leads it. */
+  get isParked(): boolean {
+    return this.isLeft && this.touches;
+  }
+
+  set isParked(on: boolean) {
+    this.isLeft = on && this.touches;
+    this.tool.changed();
+    this.onChange();
+  }
+
+  /** Whether the tool holds tissue, which moves with a drag from wherever that begins. */
+  get holdsTissue(): boolean {
+    return this.touches && (this.mode === "pull" || (this.mode === "grasper" && this.grasper.grips));
+  }
+
+  /** How far it leans from the place of the press, or from where it gripped, m. */
+  get leaningM(): Vec3 {
+    return this.leanM;
+  }
+
+  /** Where the tissue that it holds is drawn to, m. */
+  get heldM(): Vec3 {
+    return (this.grasps ? this.grasper.endsM : undefined) ?? plus(this.onSurfaceM, this.leanM);
   }
 
   /**
@@ -163,13 +192,14 @@ export class Hand {
     this.tool.changed();
   }
 
-  /** Ends the touch; the hand keeps the tool for a while. */
+  /** Ends the touch, unless the tool is parked; the hand keeps the tool for a while. */
   lift(): void {
-    this.tool.rest();
+    if (!this.isParked) this.tool.rest();
   }
 
   /** Releases the tool. */
   letGo(): Promise<void> {
+    this.isLeft = false;
     return this.tool.letGo();
   }
 
@@ -179,9 +209,10 @@ export class Hand {
     if (this.mode === "tip" || this.mode === "grasper") {
       this.sinksFromMs = this.tool.isActing ? (this.sinksFromMs ?? now) : undefined;
       const isMoving = this.sunk(now) < 1;
-      if (this.mode === "tip") return { leads: [this.tip(place, now)], isMoving };
+      const stays = this.isParked;
+      if (this.mode === "tip") return { leads: [this.tip(place, now)], isMoving, stays };
       const wanted = this.grasper.wanted(place, this.outM(now), !isMoving, this.leanM, now);
-      return { ...wanted, isMoving: isMoving || wanted.isMoving };
+      return { ...wanted, isMoving: isMoving || wanted.isMoving, stays };
     }
     return { action: this.action(place) };
   }

@@ -1,23 +1,18 @@
 // Mouse, fingers and keys on the tissue.
 
-import { Vector3 } from "three";
+import { Drag } from "./drag";
 import { OPEN } from "./grasper";
 import type { Hand, Reach } from "./hand";
+import type { Hands } from "./hands";
 import type { Latency } from "./latency";
-import type { Vec3 } from "palpate";
 import type { Stage } from "./stage";
 import type { Place, Surface } from "./surface";
 
 /** What the user can touch. */
 export interface Touched {
-  hand: Hand;
+  hands: Hands;
   surface: Surface;
   reach: Reach;
-}
-
-/** Returns whether the tool moves to the places under the drag. */
-function glides({ mode, grasper }: Hand): boolean {
-  return mode === "stroke" || mode === "tip" || (mode === "grasper" && !grasper.grips);
 }
 
 /** Rotation of the view per key press, radians. */
@@ -31,17 +26,12 @@ export class Input {
   onPlace: ((place: Place) => void) | undefined;
   /** Called with the place under a pointer that does not touch, and without a place when it leaves. */
   onPoint: (place?: Place) => void = () => {};
-  private dragging: number | undefined;
+  /** The newest drag of each hand; also of a parked one, which nothing leads. */
+  private readonly drags = new Map<Hand, Drag>();
   private readonly fingers = new Map<number, [number, number]>();
-  /** Distance of two fingers, and opening of the jaws, when the second finger came. */
-  private pinch: { apart: number; opening: number } | undefined;
-  /** Whether the right button is down beside the left one. */
-  private isChord = false;
-  /** Start of the drag: the place, and its position then. */
-  private from: { place: Place; onSurfaceM: Vec3 } | undefined;
+  /** A finger that moves the jaws: its drag, and its distance and the opening of the jaws when it came. */
+  private pinch: { finger: number; drag: Drag; apart: number; opening: number } | undefined;
   private aim: Place | undefined;
-  /** Where the pointer that drags is in the window. */
-  private pointer: [number, number] | undefined;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -60,28 +50,39 @@ export class Input {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this.key(event));
     canvas.addEventListener("keyup", (event) => {
-      if (event.key === " ") this.touched()?.hand.lift();
+      if (event.key === " ") this.end(this.ledBy("keys"));
     });
     canvas.addEventListener("blur", () => {
       this.aim = undefined;
       this.stage.setAim(undefined);
-      if (this.dragging === undefined) this.touched()?.hand.lift();
+      this.end(this.ledBy("keys"));
     });
   }
 
+  private ledBy(leader: number | "keys"): Drag | undefined {
+    return [...this.drags.values()].find((drag) => drag.leader === leader);
+  }
+
+  /** The drags of pointers. */
+  private get dragging(): Drag[] {
+    return [...this.drags.values()].filter(({ leader }) => typeof leader === "number");
+  }
+
   private down(event: PointerEvent): void {
-    if (event.pointerType === "touch") this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    const { hand } = this.touched() ?? {};
+    const isFinger = event.pointerType === "touch";
+    if (isFinger) this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    const { hands } = this.touched() ?? {};
     // If nothing can be touched, any drag turns the view.
-    if (!hand) return this.stage.turnByDrag(true);
-    if (this.fingers.size === 2 && this.dragging !== undefined && hand.mode === "grasper") {
+    if (!hands) return this.stage.turnByDrag(true);
+    const [leading] = this.dragging;
+    if (leading && (hands.isTwo || (this.fingers.size === 2 && leading.hand.mode === "grasper"))) {
       event.stopImmediatePropagation();
-      this.pinch = { apart: this.apart(), opening: hand.grasper.opening };
+      if (!hands.isTwo || !this.beginBeside(hands, event)) this.beginPinch(leading, event);
       return;
     }
     // A second finger turns the view instead.
     if (this.fingers.size > 1) return this.finish();
-    if (event.button !== 0 || this.dragging !== undefined) return;
+    if (event.button !== 0 || leading) return;
     const place = this.stage.pick(event.clientX, event.clientY);
     // Beside the tissue a drag turns the view.
     this.stage.turnByDrag(!place);
@@ -89,104 +90,136 @@ export class Input {
     this.onPoint();
     if (this.onPlace) return this.onPlace(place);
     this.latency.pressed(event.timeStamp);
-    this.canvas.setPointerCapture(event.pointerId);
-    this.dragging = event.pointerId;
-    this.pointer = [event.clientX, event.clientY];
-    this.begin(hand, place);
+    this.lead(hands.chosen, place, event);
   }
 
-  private begin(hand: Hand, place: Place): void {
-    const { surface } = this.touched() ?? {};
-    if (!surface) return;
-    // A grasp holds a mass point and begins at that point.
-    const held = hand.mode === "pull" ? surface.nearest(place) : place;
-    const moved = surface.displacementAt(held);
-    const [x, y, z] = held.restM;
-    this.from = { place: held, onSurfaceM: [x + moved.x, y + moved.y, z + moved.z] };
-    void hand.press(held, this.from.onSurfaceM, this.stage.viewOf(held));
-    if (hand.mode === "grasper") hand.onJaws();
+  /** While a pointer leads one hand, another one leads the other. Returns false if it is beside the tissue, or neither is free. */
+  private beginBeside(hands: Hands, event: PointerEvent): boolean {
+    const free = [hands.chosen, hands.other].find((hand) => typeof this.drags.get(hand)?.leader !== "number");
+    const place = free && this.stage.pick(event.clientX, event.clientY);
+    if (place) this.lead(free, place, event);
+    return place !== undefined;
   }
 
-  /** Distance of the first two fingers, pixels. */
-  private apart(): number {
-    const [[ax, ay], [bx, by]] = [...this.fingers.values()] as [[number, number], [number, number]];
+  private lead(hand: Hand, place: Place, { pointerId, clientX, clientY }: PointerEvent): void {
+    this.canvas.setPointerCapture(pointerId);
+    this.begin(hand, place, pointerId, [clientX, clientY]);
+  }
+
+  private begin(hand: Hand, place: Place, leader: number | "keys", pointer?: [number, number]): void {
+    const { surface, hands } = this.touched() ?? {};
+    if (!surface || !hands) return;
+    // Hands of a session that is left.
+    for (const old of this.drags.keys()) if (!hands.both.includes(old)) this.drags.delete(old);
+    const drag = this.drags.get(hand) ?? new Drag(hand, this.stage, () => this.touched()?.surface ?? surface);
+    this.drags.set(hand, drag);
+    drag.begin(place, leader, pointer);
+  }
+
+  /** Another finger moves the jaws of the grasper that a finger leads. */
+  private beginPinch(drag: Drag, { pointerId, pointerType }: PointerEvent): void {
+    if (pointerType !== "touch" || drag.hand.mode !== "grasper" || this.pinch) return;
+    this.pinch = { finger: pointerId, drag, apart: this.apart(pointerId, drag), opening: drag.hand.grasper.opening };
+  }
+
+  /** Distance of a finger from the pointer of a drag, pixels. */
+  private apart(finger: number, { pointer }: Drag): number {
+    const [[ax, ay], [bx, by]] = [this.fingers.get(finger) ?? [0, 0], pointer ?? [0, 0]];
     return Math.max(Math.hypot(ax - bx, ay - by), 1);
   }
 
-  /** Moves the jaws of a grasper to a fraction of their largest angle. */
+  /** Moves the jaws of the chosen hand's grasper to a fraction of their largest angle. */
   moveJaws(part: number): void {
-    const { hand } = this.touched() ?? {};
-    if (hand?.mode !== "grasper") return;
-    const { grips } = hand.grasper;
-    hand.openJaws(part);
-    const { grips: gripsNow, endsM } = hand.grasper;
-    if (gripsNow === grips || !this.from || !endsM) return;
-    if (gripsNow) {
-      // The drag counts from here.
-      const onSurfaceM = (this.pointer && this.stage.onFacingPlane(...this.pointer, endsM)) ?? endsM;
-      this.from = { place: this.aim ?? this.from.place, onSurfaceM };
-    } else if (this.pointer) {
-      const place = this.stage.pick(...this.pointer);
-      if (place) hand.goOn(place);
-    }
+    const { hands } = this.touched() ?? {};
+    if (hands?.chosen.mode !== "grasper") return;
+    const drag = this.drags.get(hands.chosen);
+    if (drag) drag.moveJaws(part, this.aim);
+    else hands.chosen.openJaws(part);
+  }
+
+  /** Closes the jaws of the chosen hand's grasper, or opens closed ones. */
+  turnJaws(): void {
+    const { hands } = this.touched() ?? {};
+    if (hands) this.moveJaws(hands.chosen.grasper.grips ? OPEN : 0);
+  }
+
+  /** Parks the chosen hand's tool, and chooses the other hand; or ends the stay of a parked one. */
+  park(): void {
+    const { hands } = this.touched() ?? {};
+    if (!hands) return;
+    const drag = this.drags.get(hands.chosen);
+    hands.park();
+    // A pointer that is still down leads it no longer.
+    if (drag?.hand.isParked) this.leave(drag);
+  }
+
+  /** The pointer or the keys no longer lead a hand. */
+  private leave(drag: Drag): void {
+    [drag.leader, drag.pointer, drag.isChord] = [undefined, undefined, false];
+    if (this.pinch?.drag === drag) this.pinch = undefined;
   }
 
   private wheel(event: WheelEvent): void {
-    const { hand } = this.touched() ?? {};
-    if (!hand || hand.mode !== "grasper" || !hand.touches) return;
+    const drag = this.dragging[0] ?? this.ledBy("keys");
+    if (drag?.hand.mode !== "grasper" || !drag.hand.touches) return;
     event.preventDefault();
     event.stopImmediatePropagation();
     const by = Math.min(Math.max(-WHEEL.pixel * event.deltaY, -WHEEL.most), WHEEL.most);
-    this.moveJaws(hand.grasper.opening + by);
+    drag.moveJaws(drag.hand.grasper.opening + by);
   }
 
   private moved(event: PointerEvent): void {
-    const { hand } = this.touched() ?? {};
+    const { pointerId, clientX, clientY, buttons } = event;
     const isMouse = event.pointerType !== "touch";
-    if (hand && isMouse && this.dragging === undefined) {
-      this.onPoint(event.buttons === 0 ? this.stage.pick(event.clientX, event.clientY) : undefined);
+    if (isMouse && this.touched() && this.dragging.length === 0) {
+      this.onPoint(buttons === 0 ? this.stage.pick(clientX, clientY) : undefined);
     }
-    if (this.fingers.has(event.pointerId)) this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    if (this.pinch && this.fingers.size > 1) this.moveJaws((this.pinch.opening * this.apart()) / this.pinch.apart);
-    if (event.pointerId !== this.dragging || !hand) return;
+    if (this.fingers.has(pointerId)) this.fingers.set(pointerId, [clientX, clientY]);
+    const { pinch } = this;
+    if (pinch && [pinch.finger, pinch.drag.leader].includes(pointerId)) {
+      if (pointerId === pinch.drag.leader) pinch.drag.pointer = [clientX, clientY];
+      pinch.drag.moveJaws((pinch.opening * this.apart(pinch.finger, pinch.drag)) / pinch.apart);
+    }
+    const drag = this.ledBy(pointerId);
+    if (!drag || !this.touched()) return;
     // While one button is down, others come and go as movements.
-    if (isMouse && (event.buttons & 1) === 0) return this.finish();
-    this.pointer = [event.clientX, event.clientY];
-    const isChord = (event.buttons & 2) !== 0;
-    if (isChord !== this.isChord) this.moveJaws(isChord ? 0 : OPEN);
-    this.isChord = isChord;
-    if (glides(hand)) {
-      const place = this.stage.pick(event.clientX, event.clientY);
-      if (place) hand.goOn(place);
-      return;
-    }
-    if (!this.from) return;
-    const at = this.stage.onFacingPlane(event.clientX, event.clientY, this.from.onSurfaceM);
-    if (!at) return;
-    const [x, y, z] = this.from.onSurfaceM;
-    hand.lean([at[0] - x, at[1] - y, at[2] - z]);
+    if (isMouse && (buttons & 1) === 0) return this.end(drag);
+    if (isMouse && (buttons & 4) !== 0 && drag.hand === this.touched()?.hands.chosen) return this.park();
+    drag.pointer = [clientX, clientY];
+    const isChord = (buttons & 2) !== 0;
+    if (isChord !== drag.isChord && drag.hand.mode === "grasper") drag.moveJaws(isChord ? 0 : OPEN);
+    drag.isChord = isChord;
+    drag.moveTo(clientX, clientY);
   }
 
-  private up(event: PointerEvent): void {
-    this.fingers.delete(event.pointerId);
-    if (this.fingers.size < 2) this.pinch = undefined;
-    if (event.pointerId === this.dragging) this.finish();
+  private up({ pointerId }: PointerEvent): void {
+    this.fingers.delete(pointerId);
+    if (this.pinch?.finger === pointerId) this.pinch = undefined;
+    this.end(this.ledBy(pointerId));
   }
 
+  /** Ends a drag: lifts the hand, unless its tool is parked. */
+  private end(drag: Drag | undefined): void {
+    if (!drag) return;
+    const isPointer = typeof drag.leader === "number";
+    this.leave(drag);
+    if (isPointer) this.stage.turnByDrag(false);
+    drag.hand.lift();
+    if (!drag.hand.touches) this.drags.delete(drag.hand);
+  }
+
+  /** Ends the drags of all pointers. */
   private finish(): void {
-    this.dragging = undefined;
-    this.from = undefined;
     this.pinch = undefined;
-    this.pointer = undefined;
-    this.isChord = false;
     this.stage.turnByDrag(false);
-    this.touched()?.hand.lift();
+    for (const drag of this.dragging) this.end(drag);
   }
 
   private key(event: KeyboardEvent): void {
     const touched = this.touched();
     if (!touched || event.ctrlKey || event.metaKey || event.altKey) return;
-    const { hand, reach } = touched;
+    const { hands, reach } = touched;
+    const byKeys = this.ledBy("keys");
     const ways: Record<string, [number, number]> = {
       ArrowLeft: [-1, 0],
       ArrowRight: [1, 0],
@@ -200,23 +233,27 @@ export class Input {
       // Right is the right side of the view.
       const from = this.aim ?? this.first(touched);
       this.aim = touched.surface.beside(from, this.stage.across(from, way).multiplyScalar(reach.lengthM));
-      if (hand.touches) this.lead(this.aim, touched);
+      byKeys?.aimAt(this.aim, this.liftM(touched));
       this.stage.setAim(this.aim);
     } else if (event.key === " ") {
-      if (!event.repeat && !hand.touches) {
+      const hand = hands.chosen;
+      if (!event.repeat && !byKeys && (!hand.touches || hand.isParked)) {
         this.aim ??= this.first(touched);
         this.latency.pressed(event.timeStamp);
-        this.begin(hand, this.aim);
-        // A pull by key lifts the point.
-        if (hand.mode === "pull") hand.lean(this.lifted([0, 0, 0], this.aim, touched));
+        this.begin(hand, this.aim, "keys");
+        this.ledBy("keys")?.aimAt(this.aim, this.liftM(touched));
         this.stage.setAim(this.aim);
       }
     } else if (event.key === "c") {
-      if (!event.repeat) this.moveJaws(hand.grasper.grips ? OPEN : 0);
+      if (!event.repeat) this.turnJaws();
+    } else if (event.key === "p") {
+      if (!event.repeat) this.park();
+    } else if (event.key === "1" || event.key === "2") {
+      hands.choose(event.key === "1" ? 0 : 1);
     } else if (event.key === "PageUp" || event.key === "PageDown") {
-      this.moveJaws(hand.grasper.opening + (event.key === "PageUp" ? JAW_STEP : -JAW_STEP));
+      this.moveJaws(hands.chosen.grasper.opening + (event.key === "PageUp" ? JAW_STEP : -JAW_STEP));
     } else if (event.key === "Escape") {
-      void hand.letGo();
+      void hands.chosen.letGo();
     } else if (event.key === "Home") {
       this.stage.resetView();
     } else if (event.key === "+" || event.key === "-") {
@@ -232,17 +269,8 @@ export class Input {
     return (surface.edge ? undefined : this.stage.pickMiddle()) ?? surface.middle();
   }
 
-  /** Returns a displacement, plus the height of a pull in the direction out of the tissue. */
-  private lifted([x, y, z]: Vec3, { outward: n }: Place, { hand, reach }: Touched): Vec3 {
-    const up = hand.mode === "pull" ? reach.depthM * hand.strength : 0;
-    return [x + up * n[0], y + up * n[1], z + up * n[2]];
-  }
-
-  /** Arrow keys while Space is down: a stroke or tip moves on, a push leans, a pull moves sideways. */
-  private lead(aim: Place, touched: Touched): void {
-    if (glides(touched.hand)) return touched.hand.goOn(aim);
-    const from = this.from?.place ?? aim;
-    const way = new Vector3(...aim.restM).sub(new Vector3(...from.restM));
-    touched.hand.lean(this.lifted(way.toArray(), from, touched));
+  /** Returns the height of a pull by keys, m. */
+  private liftM({ hands: { chosen }, reach }: Touched): number {
+    return chosen.mode === "pull" ? reach.depthM * chosen.strength : 0;
   }
 }

@@ -12,12 +12,13 @@ import { norm, type Vec3 } from "palpate";
 import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
 import type { Mode } from "./hand";
+import { HAND_NAMES, type Hands } from "./hands";
 import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { Lumps } from "./lumps";
 import { feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./messages";
-import { Overlay } from "./overlay";
+import { Overlay, type ToolLabel } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
 import { pageState } from "./page-state";
 import { keepPicture } from "./pictures";
@@ -275,11 +276,15 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   part("view", HTMLElement).classList.toggle("plays", isPlayback);
   for (const id of ["tool", "tissue-values"]) part(id, HTMLFieldSetElement).disabled = isPlayback;
   part("scripts", HTMLElement).hidden ||= isPlayback;
-  next.hand.mode = chosenMode();
-  next.hand.strength = Number(part("strength", HTMLInputElement).value);
-  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason, next));
-  next.hand.onChange = holding;
-  next.hand.onJaws = tellJaws;
+  if (formerHands) next.hands.follow(formerHands);
+  else chooseTools(next.hands);
+  formerHands = next.hands;
+  next.hands.onChoice = tellControls;
+  for (const hand of next.hands.both) {
+    hand.onRefused = (message, reason) => notice(refusedText(message, reason, next, hand));
+    hand.onChange = () => shownSession === next && holding();
+    hand.onJaws = tellJaws;
+  }
   next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
@@ -333,7 +338,7 @@ async function whatWasThat(): Promise<void> {
   const button = part("what-was-that", HTMLButtonElement);
   button.disabled = true;
   try {
-    void of.hand.letGo();
+    void of.hands.letGo();
     const { sessionId } = of.session;
     const opened = await player.begin({ sessionId, run }, (recording) => recording.after(recording.end, -BACK_S));
     if (shownSession !== of) return discard(opened.session);
@@ -383,33 +388,48 @@ function holding(): void {
     part("holder", HTMLElement).textContent = "Recorded: to touch it, go on from here";
     return;
   }
-  const mine = shownSession.hand.holds;
-  const { tool: own } = shownSession.hand;
+  const { hands } = shownSession;
+  const mine = hands.both.filter(({ holds }) => holds);
   // Somebody who holds the tool may hold more for a grasper.
   const { heldTools } = shownSession.session;
   const isFirst = (holder: string, index: number) => holder === "" || heldTools.findIndex((tool) => tool.holder === holder) === index;
-  const others = heldTools.filter(({ tool, holder }, index) => !(mine && own.has(tool)) && isFirst(holder, index));
+  const others = heldTools.filter(({ tool, holder }, index) => !hands.of(tool) && isFirst(holder, index));
   const names = others.slice(0, MAX_TOLD).map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
   const whose = excerpt(names.join(", "));
-  part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : whose || "Nobody touches: press to begin";
-  part("release", HTMLButtonElement).disabled = !mine;
+  const own = `You (${holder}) hold ${mine.length > 1 ? "two tools" : "the tool"}`;
+  part("holder", HTMLElement).textContent = mine.length > 0 ? own : whose || "Nobody touches: press to begin";
+  tellHands();
 }
 
 /** Shows the tools and the forces on them. */
 function felt(of: ShownSession): void {
   if (of !== shownSession) return;
-  const { hand, reach } = of;
-  const shown = of.samples.tools.flatMap((tool) => {
+  const { hands, reach, samples } = of;
+  const shown = samples.tools.flatMap((tool) => {
     const place = of.placeOf(tool);
     if (!place) return [];
-    const isMine = tool.tool === 0 && hand.holds;
-    if (isMine && hand.grasps) return [];
-    const strength = isMine ? of.samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
-    return [{ place, forceN: tool.forceN, part: strength }];
+    const hand = of.handOf(tool);
+    if (hand?.grasps) return [];
+    const strength = hand ? samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
+    return [{ tool: tool.tool, place, forceN: tool.forceN, part: strength }];
   });
-  const own = hand.grasps ? of.samples.tools.find(({ tool }) => tool === 0) : undefined;
-  const forceN: Vec3 = own?.forceN ?? [0, 0, 0];
-  stage.setTools(shown, hand.grasps ? hand.grasper.shown(forceN, norm(forceN) / reach.mostN) : undefined);
+  const graspers = hands.both.flatMap(({ grasps, grasper }) => {
+    const forceN: Vec3 = samples.tools.find(({ tool }) => tool === grasper.tool.tool)?.forceN ?? [0, 0, 0];
+    return (grasps && grasper.shown(forceN, norm(forceN) / reach.mostN)) || [];
+  });
+  stage.setTools(shown, graspers);
+}
+
+/** Returns what to write beside the tools of this page's hands; if there are none, beside the first tool. */
+function labels({ hands, samples }: ShownSession): ToolLabel[] {
+  const own = hands.both.flatMap((hand, number) => {
+    const tool = hand.holds ? samples.tools.find((each) => each.tool === hand.tool.tool) : undefined;
+    if (!tool) return [];
+    const title = hands.isTwo ? `${HAND_NAMES[number]!}${hand.isParked ? ", parked" : ""}` : "";
+    return [{ tool: tool.tool, told: samples.tell(tool), title }];
+  });
+  const [first] = samples.tools;
+  return own.length === 0 && first ? [{ tool: first.tool, told: samples.tell(first), title: "" }] : own;
 }
 
 function tellControls(): void {
@@ -420,7 +440,29 @@ function tellControls(): void {
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(shownSession.refinement);
   part("meaning", HTMLElement).textContent = meaningText(shownSession);
+  for (const choice of modeChoices()) choice.checked = choice.value === shownSession.hand.mode;
+  part("strength", HTMLInputElement).value = String(shownSession.hand.strength);
   tellJaws();
+  tellHands();
+}
+
+/** Shows which hand the controls set, and whether its tool stays where it is. */
+function tellHands(): void {
+  if (!shownSession) return;
+  const { hands, hand } = shownSession;
+  part("two-hands", HTMLInputElement).checked = hands.isTwo;
+  part("hands", HTMLElement).hidden = !hands.isTwo;
+  part("view", HTMLElement).classList.toggle("two", hands.isTwo);
+  for (const choice of handChoices()) choice.checked = Number(choice.value) === hands.number;
+  hands.both.forEach(({ isParked }, number) => {
+    part(`hand-${number}`, HTMLElement).textContent = `${HAND_NAMES[number]!}${isParked ? ", parked" : ""}`;
+  });
+  part("release", HTMLButtonElement).disabled = !hand.holds;
+  for (const id of ["park", "park-here"]) {
+    const button = part(id, HTMLButtonElement);
+    button.disabled = !hand.touches;
+    button.setAttribute("aria-pressed", String(hand.isParked));
+  }
 }
 
 function tellJaws(): void {
@@ -430,11 +472,30 @@ function tellJaws(): void {
   part("view", HTMLElement).classList.toggle("grasps", hand.mode === "grasper");
   part("jaws", HTMLInputElement).value = String(hand.grasper.opening);
   part("jaws-value", HTMLOutputElement).value = hand.grasper.openingText;
+  const button = part("jaws-here", HTMLButtonElement);
+  button.hidden = hand.mode !== "grasper";
+  button.textContent = hand.grasper.grips ? "Open jaws" : "Close jaws";
 }
 
+const modeChoices = () => document.querySelectorAll<HTMLInputElement>("input[name=mode]");
+const handChoices = () => document.querySelectorAll<HTMLInputElement>("input[name=hand]");
+
 function chosenMode(): Mode {
-  const chosen = document.querySelector<HTMLInputElement>("input[name=mode]:checked");
-  return (chosen?.value ?? "push") as Mode;
+  return ([...modeChoices()].find(({ checked }) => checked)?.value ?? "push") as Mode;
+}
+
+/** The hands of the session that was shown last. */
+let formerHands: Hands | undefined;
+/** Sets the tools of the first session's hands: by the address, or by the controls. */
+function chooseTools(hands: Hands): void {
+  const [first, second] = (asked.get("tool") ?? "").split(",");
+  const isMode = (mode: string | undefined): mode is Mode => [...modeChoices()].some(({ value }) => value === mode);
+  const [hand, other] = hands.both;
+  hand.mode = isMode(first) ? first : chosenMode();
+  hand.strength = Number(part("strength", HTMLInputElement).value);
+  if (!isMode(second)) return;
+  hands.isTwo = true;
+  other.mode = second;
 }
 
 part("mode", HTMLElement).addEventListener("change", () => {
@@ -450,6 +511,26 @@ part("jaws", HTMLInputElement).addEventListener("input", (event) => {
   input.moveJaws(Number((event.target as HTMLInputElement).value));
 });
 part("release", HTMLButtonElement).addEventListener("click", () => void shownSession?.hand.letGo());
+part("two-hands", HTMLInputElement).addEventListener("change", (event) => {
+  if (shownSession) shownSession.hands.isTwo = (event.target as HTMLInputElement).checked;
+});
+part("hands", HTMLElement).addEventListener("change", (event) => {
+  shownSession?.hands.choose(Number((event.target as HTMLInputElement).value) === 1 ? 1 : 0);
+});
+part("park", HTMLButtonElement).addEventListener("click", () => input.park());
+onTap("park-here", () => input.park());
+onTap("jaws-here", () => input.turnJaws());
+
+/** Calls `act` for a button that a finger may tap while others touch the tissue: browsers make no click of that. */
+function onTap(id: string, act: () => void): void {
+  const button = part(id, HTMLButtonElement);
+  button.addEventListener("click", act);
+  button.addEventListener("touchstart", (event) => {
+    // Of a single finger there would be a click as well.
+    if (event.cancelable) event.preventDefault();
+    if (!button.disabled) act();
+  });
+}
 part("wireframe", HTMLInputElement).addEventListener("change", (event) => {
   stage.setWireframe((event.target as HTMLInputElement).checked);
 });
@@ -494,7 +575,7 @@ async function play(): Promise<void> {
   button.textContent = "Stop";
   try {
     // A script takes the tools itself.
-    await shownSession.hand.letGo();
+    await shownSession.hands.letGo();
     const name = part("script", HTMLSelectElement).value;
     const warnings = await playScript(sessionId, name, shownSession.rateHz, `${holder}, ${name}`, own.signal, (done) => {
       button.textContent = `Stop (${Math.round(100 * done)} %)`;
@@ -531,7 +612,7 @@ document.addEventListener("visibilitychange", () => {
 });
 addEventListener("pagehide", () => {
   server.leave();
-  void shownSession?.hand.letGo();
+  void shownSession?.hands.letGo();
   player.close();
 });
 // A page restored from the browser's cache no longer has a session of its own.
@@ -550,8 +631,10 @@ setInterval(() => {
   plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0, 0.4 * reach.lengthM, 0.1 * reach.mostN);
   const tool = samples.tools[0];
   const told = tool && samples.tell(tool);
-  overlay.tell(told);
-  part("felt", HTMLElement).textContent = feltText(shownSession, told);
+  const labelled = labels(shownSession);
+  overlay.tell(labelled);
+  part("felt", HTMLElement).textContent = feltText(shownSession, labelled);
+  tellHands();
   part("why", HTMLElement).classList.toggle("none", !isLess(shownSession, told));
 }, 100);
 setInterval(() => {
@@ -563,7 +646,7 @@ setInterval(() => {
   const audited = session.audit?.newestError;
   status.show({
     roundTripMs: shownSession.roundTripMs,
-    networkMs: shownSession.hand.tool.networkMs,
+    networkMs: (shownSession.hands.holding ?? shownSession.hand).tool.networkMs,
     way: wayText(shownSession),
     frameAgeMs: shownSession.frameAgeMs,
     isStill: isStill(shownSession),
@@ -610,10 +693,6 @@ Object.assign(window, { palpate: pageState(() => shownSession, stage, player, la
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";
 stage.setWireframe(wireframe.checked);
-const mode = asked.get("tool");
-for (const choice of document.querySelectorAll<HTMLInputElement>("input[name=mode]")) {
-  if (choice.value === mode) choice.checked = true;
-}
 const first = addressed();
 const asksFor = asked.get("scene");
 choices.markScene(asksFor ?? "");

@@ -3,8 +3,8 @@
 
 import { Color, DoubleSide, ShaderMaterial, type Texture, Vector2, Vector3, Vector4 } from "three";
 
-/** Number of tools that cast a shadow. Each of them costs time at every pixel. */
-export const SHADOWS = 1;
+/** Number of tools that cast a shadow: those of both hands. Each that does costs time at every pixel. */
+export const SHADOWS = 2;
 
 /** Uniforms that the shaders share; `Stage` and `ToolMark` write them. */
 export const light = {

@@ -1,9 +1,9 @@
 // Messages about a session and its tools for the user.
 
 import { type Session, SessionState, TipShape } from "palpate/v1";
-import { depthText, jawsText } from "./overlay";
+import { depthText, jawsText, type ToolLabel } from "./overlay";
 import { quantity } from "./plot";
-import type { Mode } from "./hand";
+import type { Hand, Mode } from "./hand";
 import type { Told } from "./samples";
 import type { ShownSession } from "./session";
 
@@ -37,7 +37,7 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
 }
 
 /** Describes for the user why a touch was refused. */
-export function refusedText(message: string, reason: string, { session, hand }: ShownSession): string {
+export function refusedText(message: string, reason: string, { session }: ShownSession, hand: Hand): string {
   if (reason === "ROLE_MISSING") return "Your token lets you watch, not touch.";
   if (reason !== "TOOL_HELD") return `${sentence(message)}.`;
   const name = session.heldTools.find(({ tool }) => hand.tool.has(tool))?.holder || "Somebody else";
@@ -81,19 +81,28 @@ export function isLess({ hand: { mode, strength }, reach }: ShownSession, told: 
   return told !== undefined && ["push", "stroke"].includes(mode) && told.allN < LESS * strength * reach.mostN;
 }
 
-/** Describes what a tool feels. */
-export function feltText({ hand }: ShownSession, told: Told | undefined): string {
+/** Describes what the tools of this page's hands feel, or else what the first tool feels. */
+export function feltText({ hands, hand }: ShownSession, labels: readonly ToolLabel[]): string {
+  const [label] = labels;
+  if (hands.isTwo && labels.length > 1) return labels.map(({ told, title }) => `${title}: ${toldText(told, "")}`).join("\n");
+  const told = label?.told;
   const { setM } = hand;
   if (setM !== undefined && (told?.deepM ?? 0) < SLIPPED * setM) {
     const now = told ? `now ${depthText(told)}, not ${quantity(setM, "m")}` : "it does not touch any more";
     return `The tip has slipped off: ${now}. Set less depth.`;
   }
-  if (!told) return "Nothing touches the tissue.";
-  return [depthText(told), `pushes back ${quantity(told.allN, "N")}`, jawsText(told)].filter((text) => text !== "").join(", ");
+  if (!label) return "Nothing touches the tissue.";
+  return label.title ? `${label.title}: ${toldText(label.told, "")}` : toldText(label.told, "pushes back ");
+}
+
+/** Describes what a tool feels; `verb` is before the force, or else the word "back" after it. */
+function toldText(told: Told, verb: string): string {
+  const force = `${verb}${quantity(told.allN, "N")}${verb === "" ? " back" : ""}`;
+  return [depthText(told), force, jawsText(told)].filter((text) => text !== "").join(", ");
 }
 
 /** Describes the transport of a touch: datagrams belong to a lease. */
-export function wayText({ hand }: ShownSession): string {
-  if (!hand.holds) return "no tool is held";
-  return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";
+export function wayText({ hands: { holding } }: ShownSession): string {
+  if (!holding) return "no tool is held";
+  return holding.tool.datagrams.carries ? "datagrams" : "gRPC-web";
 }

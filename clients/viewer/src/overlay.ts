@@ -1,4 +1,4 @@
-// The overlays on the picture: the scale bar, the depth and the force beside the tool, and a ring at the pointer that
+// The overlays on the picture: the scale bar, the depth and the force beside each tool, and a ring at the pointer that
 // shows how far a press would move the tissue.
 
 import { part } from "./page";
@@ -22,11 +22,46 @@ export function jawsText({ openingNM }: Told): string {
   return openingNM === undefined ? "" : `jaws ${quantity(openingNM, "N·m").replace("-", "−")}`;
 }
 
+/** What a tool feels, as shown beside it. */
+export interface ToolLabel {
+  /** Number of the tool. */
+  tool: number;
+  told: Told;
+  /** Which hand's it is, if there are two. */
+  title: string;
+}
+
+/** The text beside a tool. */
+class Label {
+  /** The tool that it is beside. */
+  tool = 0;
+  private readonly title: HTMLElement;
+  private readonly depth: HTMLElement;
+  private readonly force: HTMLElement;
+  private readonly jaws: HTMLElement;
+
+  constructor(readonly element: HTMLElement) {
+    const line = (name: string) => {
+      const made = document.createElement("span");
+      made.className = name;
+      element.append(made);
+      return made;
+    };
+    [this.title, this.depth, this.force, this.jaws] = ["title", "depth", "force", "jaws"].map(line) as [HTMLElement, HTMLElement, HTMLElement, HTMLElement];
+  }
+
+  write({ tool, told, title }: ToolLabel): void {
+    this.tool = tool;
+    this.title.textContent = title;
+    this.depth.textContent = depthText(told);
+    this.force.textContent = `${quantity(told.allN, "N")} back`;
+    this.jaws.textContent = jawsText(told);
+  }
+}
+
 export class Overlay {
-  private readonly touch = part("touch", HTMLElement);
-  private readonly depth = part("touch-depth", HTMLElement);
-  private readonly force = part("touch-force", HTMLElement);
-  private readonly jaws = part("touch-jaws", HTMLElement);
+  private readonly labels = ["touch", "touch-other"].map((id) => new Label(part(id, HTMLElement)));
+  private readonly view = part("view", HTMLElement);
   private readonly bar = part("scale-bar", HTMLElement);
   private readonly length = part("scale-text", HTMLElement);
   private readonly ring = document.getElementById("pointer-ring") as unknown as SVGPathElement;
@@ -36,20 +71,14 @@ export class Overlay {
 
   constructor(private readonly stage: Stage) {}
 
-  /** Shows what the first tool feels; nothing if there is none. */
-  tell(felt: Told | undefined): void {
-    if (this.touch.hidden === (felt === undefined)) return void (felt && this.write(felt));
-    this.touch.hidden = felt === undefined;
-    if (felt) {
-      this.write(felt);
-      this.place();
-    }
-  }
-
-  private write(felt: Told): void {
-    this.depth.textContent = depthText(felt);
-    this.force.textContent = `${quantity(felt.allN, "N")} back`;
-    this.jaws.textContent = jawsText(felt);
+  /** Shows what tools feel: two at most. */
+  tell(tools: readonly ToolLabel[]): void {
+    this.labels.forEach((label, index) => {
+      const tool = tools[index];
+      label.element.hidden = tool === undefined;
+      if (tool) label.write(tool);
+    });
+    this.place();
   }
 
   /** Shows what a press would move; nothing without a place. The picture itself need not be drawn again. */
@@ -61,7 +90,7 @@ export class Overlay {
   private drawRing(): void {
     const { pointed } = this;
     if (!pointed) return this.ring.removeAttribute("d");
-    const { left, top } = this.touch.parentElement!.getBoundingClientRect();
+    const { left, top } = this.view.getBoundingClientRect();
     const corners = this.stage.ringInWindow(pointed.place, pointed.radiusM);
     this.ring.setAttribute("d", `M${corners.map(([x, y]) => `${(x - left).toFixed(1)} ${(y - top).toFixed(1)}`).join("L")}Z`);
   }
@@ -70,20 +99,28 @@ export class Overlay {
   drawn(): void {
     this.measure();
     if (this.pointed) this.drawRing();
-    if (!this.touch.hidden) this.place();
+    this.place();
   }
 
+  /** Places each label beside its tool, and below one before it that it would cover. */
   private place(): void {
-    const at = this.stage.tipInWindow();
-    if (!at) return;
-    const view = this.touch.parentElement!.getBoundingClientRect();
-    const [width, height] = [this.touch.offsetWidth, this.touch.offsetHeight];
-    const [x, y] = [at[0] - view.left, at[1] - view.top];
-    // To the left of the tool, which comes from the right; if there is no room, to the right and below.
-    const hasRoom = x - BESIDE - width > 8;
-    const left = hasRoom ? x - BESIDE - width : Math.min(x + BESIDE, view.width - width - 8);
-    const top = Math.min(Math.max(hasRoom ? y - height / 2 : y + BESIDE / 2, 8), view.height - height - 8);
-    this.touch.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
+    const view = this.view.getBoundingClientRect();
+    const taken: { left: number; right: number; top: number; bottom: number }[] = [];
+    for (const { element, tool } of this.labels) {
+      const at = element.hidden ? undefined : this.stage.tipInWindow(tool);
+      if (!at) continue;
+      const [width, height] = [element.offsetWidth, element.offsetHeight];
+      const [x, y] = [at[0] - view.left, at[1] - view.top];
+      // To the left of the tool, which comes from the right; if there is no room, to the right and below.
+      const hasRoom = x - BESIDE - width > 8;
+      const left = hasRoom ? x - BESIDE - width : Math.min(x + BESIDE, view.width - width - 8);
+      const within = (top: number) => Math.min(Math.max(top, 8), view.height - height - 8);
+      let top = within(hasRoom ? y - height / 2 : y + BESIDE / 2);
+      const covered = taken.find((other) => left < other.right && left + width > other.left && top < other.bottom && top + height > other.top);
+      if (covered) top = within(covered.bottom + height + 8 < view.height ? covered.bottom + 4 : covered.top - height - 4);
+      taken.push({ left, right: left + width, top, bottom: top + height });
+      element.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
+    }
   }
 
   private measure(): void {
@@ -92,7 +129,7 @@ export class Overlay {
     if (!Number.isFinite(pixels) || pixels <= 0) return;
     this.measured = this.stage.views;
     this.length.parentElement!.hidden = false;
-    const most = Math.min(LONGEST.pixels, LONGEST.part * this.touch.parentElement!.clientWidth) / pixels;
+    const most = Math.min(LONGEST.pixels, LONGEST.part * this.view.clientWidth) / pixels;
     const power = 10 ** Math.floor(Math.log10(most));
     const lengthM = power * ([5, 2].find((times) => times * power <= most) ?? 1);
     this.bar.style.width = `${(lengthM * pixels).toFixed(1)}px`;

@@ -31,17 +31,30 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     get forceN() {
       return present()?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
     },
-    /** Forces on each tool of the hand, by the newest sample. */
+    /** Forces on each tool of the chosen hand, by the newest sample. */
     get ownForcesN() {
       const { hand, samples } = present() ?? {};
-      return (samples?.newest?.tools ?? []).flatMap((tool) => (hand?.tool.has(tool.tool) ? [norm(vec(tool.forceOnToolN))] : []));
+      return (samples?.toolSamples ?? []).flatMap((tool) => (hand?.tool.has(tool.tool) ? [norm(vec(tool.forceOnToolN))] : []));
+    },
+    /** The hands: what each does, and the force on it; and the number of the chosen one. */
+    get hands() {
+      const { hands, samples } = present() ?? {};
+      const both = (hands?.both ?? []).map(({ mode, touches, isParked, grasper, holds, tool }) => {
+        const felt = holds ? samples?.tools.find((each) => each.tool === tool.tool) : undefined;
+        return { mode, touches, isParked, grips: grasper.grips, forceN: felt ? norm(felt.forceN) : 0 };
+      });
+      return { both, chosen: hands?.number, isTwo: hands?.isTwo };
+    },
+    /** Simulated time of the newest sample, s. */
+    get sampledS() {
+      return present()?.samples.newest?.simulationTimeS ?? 0;
     },
     /** Largest displacement of the control point during the time span of the plots. */
     get deepestM() {
       return Math.max(0, ...(present()?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
     },
     get holds() {
-      return present()?.hand.holds ?? false;
+      return present()?.hands.holding !== undefined;
     },
     /** The recording that is played, if any. */
     get recording() {
@@ -56,7 +69,7 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
      * and samples in them.
      */
     get datagrams() {
-      const { carries, counts } = present()?.hand.tool.datagrams ?? {};
+      const { carries, counts } = (present()?.hands.holding ?? present()?.hand)?.tool.datagrams ?? {};
       return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
     },
     /**

@@ -1,4 +1,4 @@
-// The session that the page shows: its streams, its surface and the hand, until the user leaves it.
+// The session that the page shows: its streams, its surface and the hands, until the user leaves it.
 
 import { Body } from "./body";
 import { fingerM } from "./coefficients";
@@ -6,6 +6,7 @@ import { isBarred } from "./token-form";
 import { fetchMesh, Frames, type MeshData, norm, plus, type Vec3 } from "palpate";
 import { type Session, TipShape } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
+import { Hands } from "./hands";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
 import { gridOf, Sheet } from "./sheet";
@@ -34,7 +35,7 @@ export interface Told {
 export class ShownSession {
   readonly frames = new Frames(server);
   readonly samples: Samples;
-  readonly hand: Hand;
+  readonly hands: Hands;
   readonly reach: Reach;
   /** Width of the tissue, m. */
   readonly widthM: number;
@@ -124,8 +125,10 @@ export class ShownSession {
     this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool), (tools) => this.joined(tools));
     // Until its own samples arrive, those of the former session are shown.
     if (former) this.samples.follow(former.samples, session.simulationTimeS);
-    this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz));
-    this.hand.onSample = (sample) => this.samples.takeOwn(sample);
+    // All pages use the same tools.
+    const hand = (firstTool: number) => new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz), firstTool);
+    this.hands = new Hands([hand(0), hand(2 * this.reach.jawTips)]);
+    for (const each of this.hands.both) each.onSample = (sample) => this.samples.takeOwn(sample);
   }
 
   /** Returns the number of vertices along a side of a sheet at refinement n: M = (m − 1)·n + m. */
@@ -139,30 +142,45 @@ export class ShownSession {
     return new Sheet(nx, ny, this.reach.lengthM / (n + 1), n + 1);
   }
 
-  /** Returns the side that a tool touches. How a force is distributed is known only of this page's hand. */
+  /** The hand that is chosen. */
+  get hand(): Hand {
+    return this.hands.chosen;
+  }
+
+  /** Returns the side that a tool touches. How a force is distributed is known only of this page's hands. */
   private sense(tool: Felt): Sense {
-    const isMine = tool.tool === 0 && this.hand.holds;
-    const outward = (isMine && this.hand.outward) || this.placeOf(tool)?.outward || [0, 0, 1];
-    return { outward, share: isMine ? this.hand.share : 1 };
+    const hand = this.handOf(tool);
+    const outward = hand?.outward ?? this.placeOf(tool)?.outward ?? [0, 0, 1];
+    return { outward, share: hand?.share ?? 1 };
   }
 
-  /** Returns where a tool touches. For this page's hand, the side is known. */
+  /** Returns where a tool touches. For this page's hands, the side is known. */
   placeOf(tool: Felt): Place | undefined {
-    const isMine = tool.tool === 0 && this.hand.holds;
-    return this.surface.ofTool(tool, isMine ? this.hand.isOuter : undefined);
+    return this.surface.ofTool(tool, this.handOf(tool)?.isOuter);
   }
 
-  /** Returns tools with those of this page's grasper as one: at the tip that feels most, with the sum of the forces. */
+  /** Returns the hand of this page whose first tool this is, if it holds it. */
+  handOf({ tool }: Felt): Hand | undefined {
+    return this.hands.both.find((hand) => hand.holds && hand.tool.tool === tool);
+  }
+
+  /** Returns tools with those of each hand as one, the chosen hand's first. */
   private joined(tools: Felt[]): Felt[] {
-    const { grasps, grasper } = this.hand;
-    const own = grasps ? tools.filter(({ tool }) => grasper.tool.has(tool)) : [];
-    const felt = grasper.felt(own);
-    if (!felt || own.length === 0) return tools;
+    const of = (hand: Hand) => tools.filter(({ tool }) => hand.holds && hand.tool.has(tool));
+    const { chosen, other } = this.hands;
+    const own = [of(chosen), of(other)] as const;
+    const others = tools.filter((tool) => !own.flat().includes(tool));
+    return [...this.joinedOf(chosen, own[0]), ...this.joinedOf(other, own[1]), ...others];
+  }
+
+  /** Returns the tools of a grasper as one: at the tip that feels most, with the sum of the forces. */
+  private joinedOf({ grasps, grasper }: Hand, own: Felt[]): Felt[] {
+    const felt = grasps ? grasper.felt(own) : undefined;
+    if (!felt || own.length === 0) return own;
     const most = own.reduce((a, b) => (norm(b.forceN) > norm(a.forceN) ? b : a));
     const appliedN = own.reduce<Vec3>((sum, tool) => plus(sum, tool.appliedN), [0, 0, 0]);
     const openingNM = grasper.grips ? felt.openingNM : undefined;
-    const joined = { ...most, tool: grasper.tool.tool, forceN: felt.forceN, appliedN, openingNM };
-    return [joined, ...tools.filter((tool) => !own.includes(tool))];
+    return [{ ...most, tool: grasper.tool.tool, forceN: felt.forceN, appliedN, openingNM }];
   }
 
   begin(): void {
@@ -208,7 +226,7 @@ export class ShownSession {
   }
 
   leave(): void {
-    void this.hand.letGo();
+    void this.hands.letGo();
     this.ended.abort();
     this.seen.abort();
   }

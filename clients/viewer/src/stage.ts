@@ -26,7 +26,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { Body } from "./body";
 import { Effort, isDrawnBySoftware } from "./effort";
 import type { ShownGrasper, View } from "./grasper";
-import { GrasperMark } from "./grasper-mark";
+import { GrasperMark, isSamePose } from "./grasper-mark";
 import { Ground } from "./ground";
 import { defaultCameraOfBody, defaultCameraOfSheet } from "./default-camera";
 import { light, Skin, SHADOWS } from "./material";
@@ -93,8 +93,9 @@ export class Stage {
   private surface: Surface | undefined;
   private readonly marks: ToolMark[] = [];
   private tools: ShownTool[] = [];
-  private readonly grasperMark = new GrasperMark();
-  private grasper: ShownGrasper | undefined;
+  /** This page has two hands. */
+  private readonly grasperMarks = [new GrasperMark(), new GrasperMark()];
+  private graspers: ShownGrasper[] = [];
   private aim: Place | undefined;
   /** Whether the camera is still in its initial position. */
   private isHome = true;
@@ -132,7 +133,7 @@ export class Stage {
     this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !this.isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.camera.up.set(0, 0, 1);
-    this.scene.add(this.camera, this.grasperMark.group);
+    this.scene.add(this.camera, ...this.grasperMarks.map(({ group }) => group));
     this.orbit = new OrbitControls(this.camera, canvas);
     // The left button and one finger control the tool.
     this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.PAN, RIGHT: MOUSE.ROTATE };
@@ -245,20 +246,27 @@ export class Stage {
     this.draw();
   }
 
-  /** Shows tools, and this page's own grasper. */
-  setTools(tools: ShownTool[], grasper?: ShownGrasper): void {
+  /** Shows tools, and this page's own graspers. */
+  setTools(tools: ShownTool[], graspers: ShownGrasper[] = []): void {
+    const isNear = ({ forceN, part }: { forceN: Vec3; part: number }, before: Vec3) => {
+      const least = 2e-3 * (norm(forceN) / (part || 1));
+      return forceN.every((v, c) => Math.abs(v - before[c]!) < least);
+    };
     const isSame =
-      grasper?.pose === this.grasper?.pose &&
+      graspers.length === this.graspers.length &&
+      graspers.every((grasper, index) => {
+        const old = this.graspers[index]!;
+        return isSamePose(grasper.pose, old.pose) && isNear(grasper, old.forceN);
+      }) &&
       tools.length === this.tools.length &&
-      tools.every(({ place, forceN, part }, index) => {
+      tools.every((tool, index) => {
         const old = this.tools[index]!;
-        const least = 2e-3 * (norm(forceN) / (part || 1));
-        return place.restM.every((v, c) => v === old.place.restM[c]) && forceN.every((v, c) => Math.abs(v - old.forceN[c]!) < least);
+        return tool.place.restM.every((v, c) => v === old.place.restM[c]) && isNear(tool, old.forceN);
       });
     if (isSame) return;
-    [this.tools, this.grasper] = [tools, grasper];
+    [this.tools, this.graspers] = [tools, graspers];
     while (this.marks.length < tools.length) {
-      const mark = new ToolMark(this.marks.length);
+      const mark = new ToolMark();
       this.marks.push(mark);
       this.scene.add(mark.group);
     }
@@ -272,24 +280,29 @@ export class Stage {
     const surface = this.surface;
     this.seen.right.setFromMatrixColumn(this.camera.matrixWorld, 0);
     this.seen.eye.copy(this.camera.position);
-    for (let index = 0; index < this.marks.length; index++) {
+    for (const shadowed of [...light.tips.value, ...light.rings.value]) shadowed.w = 0;
+    this.grasperMarks.forEach((mark, index) => {
+      const grasper = this.held ? undefined : this.graspers[index];
+      if (grasper && surface) mark.show(grasper, surface, surface.sizeM, index);
+      else mark.hide();
+    });
+    this.marks.forEach((mark, index) => {
       const tool = this.held ? undefined : this.tools[index];
-      if (tool && surface) this.marks[index]!.show(tool, surface, surface.sizeM, this.seen);
-      else this.marks[index]!.hide();
-    }
-    if (this.grasper && surface && !this.held) this.grasperMark.show(this.grasper, surface, surface.sizeM);
-    else this.grasperMark.hide();
+      if (tool && surface) mark.show(tool, surface, surface.sizeM, this.seen, this.graspers.length + index);
+      else mark.hide();
+    });
     const ring = light.rings.value[SHADOWS]!;
-    ring.w = 0;
     if (!this.aim || !surface || this.held) return;
     const at = this.spot.set(...this.aim.restM).add(surface.displacementAt(this.aim));
     ring.set(at.x, at.y, at.z, surface.sizeM / 42);
   }
 
-  /** Returns the window position of the first tool's tip; undefined if there is no tool. */
-  tipInWindow(): [number, number] | undefined {
-    if (this.grasper) return this.inWindow(this.grasperMark.endsM.toArray());
-    return this.tools.length > 0 && this.marks[0] ? this.inWindow(this.marks[0].tipM.toArray()) : undefined;
+  /** Returns the window position of a tool's tip; undefined if it is not drawn. */
+  tipInWindow(number: number): [number, number] | undefined {
+    const grasper = this.graspers.findIndex(({ tool }) => tool === number);
+    if (grasper >= 0) return this.inWindow(this.grasperMarks[grasper]!.endsM.toArray());
+    const mark = this.marks[this.tools.findIndex(({ tool }) => tool === number)];
+    return mark && this.inWindow(mark.tipM.toArray());
   }
 
   /** Smallest distance between a drawn tool and the drawn tissue, m; undefined without a tool. */

@@ -16,6 +16,8 @@ import type { Place, Surface } from "./surface";
 
 /** A tool in the state of the server's sample. */
 export interface ShownTool {
+  /** Its number. */
+  tool: number;
   /** The control point. */
   place: Place;
   /** Force of the tissue on the tool. */
@@ -78,7 +80,7 @@ export class ToolMark {
   private lengthM = 0;
   private roomM = Infinity;
 
-  constructor(private readonly index: number) {
+  constructor() {
     const steel = new Steel(0xd5d9de);
     this.probe.add(
       new Mesh(new SphereGeometry(1, 28, 20), steel),
@@ -100,13 +102,10 @@ export class ToolMark {
   hide(): void {
     this.group.visible = false;
     this.isNew = true;
-    if (this.index >= SHADOWS) return;
-    light.tips.value[this.index]!.w = 0;
-    light.rings.value[this.index]!.w = 0;
   }
 
-  /** Puts the tool on the tissue as it is drawn. `size` is the tissue's, m. */
-  show(tool: ShownTool, surface: Surface, size: number, { right, eye }: Seen): void {
+  /** Puts the tool on the tissue as it is drawn. `size` is the tissue's, m; the first tools by `index` cast shadows. */
+  show(tool: ShownTool, surface: Surface, size: number, { right, eye }: Seen, index: number): void {
     this.group.visible = true;
     const { place } = tool;
     const moved = this.moved.copy(surface.displacementAt(place));
@@ -149,12 +148,12 @@ export class ToolMark {
       this.foot.position.copy(this.gauge.position).addScaledVector(this.out, high);
       this.foot.scale.setScalar(r);
     }
-    if (this.index >= SHADOWS) return;
-    light.tips.value[this.index]!.set(this.tipM.x, this.tipM.y, this.tipM.z, r);
+    if (index >= SHADOWS) return;
+    light.tips.value[index]!.set(this.tipM.x, this.tipM.y, this.tipM.z, r);
     const end = this.tried.copy(this.tipM).addScaledVector(this.axis, this.lengthM);
-    light.shafts.value[this.index]!.set(end.x, end.y, end.z, 1.2 * SHAFT * r);
+    light.shafts.value[index]!.set(end.x, end.y, end.z, 1.2 * SHAFT * r);
     // In a dent of a body there would be several rings, where its walls intersect the sphere.
-    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(deep && !surface.edge ? 0 : 2.1 * r);
+    light.rings.value[index]!.copy(light.tips.value[index]!).setW(deep && !surface.edge ? 0 : 2.1 * r);
   }
 
   /** Updates the directions at the place. A shaft keeps its tilt while it stays there. */

@@ -215,6 +215,7 @@ export class Server {
 
 /**
  * @typedef {{
+ *   sampledS: number, hands: { both: { mode: string, touches: boolean, isParked: boolean, grips: boolean, forceN: number }[], chosen: number, isTwo: boolean },
  *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[], ownForcesN: number[],
  *   clear: number | undefined, cameraHeight: number, widthM: number, drawing: { isDrawn: boolean, isTextured: boolean, hasTexture: boolean },
  *   recording: { sessionId: string, run: number, begin: number, end: number, step: number, isPlaying: boolean, isBusy: boolean, speed: number, playback: string } | undefined,
