@@ -11,6 +11,8 @@ import type { Place } from "./surface";
 const LONGEST = { pixels: 150, part: 0.28 };
 /** Distance of the text from the tip, pixels. */
 const BESIDE = 46;
+/** Distance that a text keeps from the tip of another tool, pixels. */
+const NEAR = 12;
 
 /** Describes a depth or height. */
 export function depthText({ deepM }: Told): string {
@@ -102,24 +104,27 @@ export class Overlay {
     this.place();
   }
 
-  /** Places each label beside its tool, and below one before it that it would cover. */
+  /** Places each label beside its tool, where it covers neither the other tool nor its label, if there is room. */
   private place(): void {
     const view = this.view.getBoundingClientRect();
-    const taken: { left: number; right: number; top: number; bottom: number }[] = [];
-    for (const { element, tool } of this.labels) {
-      const at = element.hidden ? undefined : this.stage.tipInWindow(tool);
-      if (!at) continue;
+    const shown = this.labels.flatMap((label) => {
+      const at = label.element.hidden ? undefined : this.stage.tipInWindow(label.tool);
+      return at ? [{ element: label.element, tool: label.tool, x: at[0] - view.left, y: at[1] - view.top }] : [];
+    });
+    const taken: { left: number; top: number; width: number; height: number }[] = [];
+    for (const { element, tool, x, y } of shown) {
       const [width, height] = [element.offsetWidth, element.offsetHeight];
-      const [x, y] = [at[0] - view.left, at[1] - view.top];
-      // To the left of the tool, which comes from the right; if there is no room, to the right and below.
-      const hasRoom = x - BESIDE - width > 8;
-      const left = hasRoom ? x - BESIDE - width : Math.min(x + BESIDE, view.width - width - 8);
-      const within = (top: number) => Math.min(Math.max(top, 8), view.height - height - 8);
-      let top = within(hasRoom ? y - height / 2 : y + BESIDE / 2);
-      const covered = taken.find((other) => left < other.right && left + width > other.left && top < other.bottom && top + height > other.top);
-      if (covered) top = within(covered.bottom + height + 8 < view.height ? covered.bottom + 4 : covered.top - height - 4);
-      taken.push({ left, right: left + width, top, bottom: top + height });
-      element.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
+      const within = (v: number, most: number) => Math.min(Math.max(v, 8), most - 8);
+      const spot = (left: number, top: number) => ({ left: within(left, view.width - width), top: within(top, view.height - height), width, height });
+      // To the left of the tool, which comes from the right; if there is no room, to the right and below, or above.
+      const lefts = x - BESIDE - width > 8 ? [spot(x - BESIDE - width, y - height / 2), spot(x - BESIDE - width, y - height - BESIDE / 2)] : [];
+      const spots = [...lefts, spot(x + BESIDE, y + BESIDE / 2), spot(x + BESIDE, y - height - BESIDE / 2)] as const;
+      const isFree = ({ left, top }: { left: number; top: number }) =>
+        shown.every((other) => other.tool === tool || !(other.x > left - NEAR && other.x < left + width + NEAR && other.y > top - NEAR && other.y < top + height + NEAR)) &&
+        taken.every((other) => left >= other.left + other.width || left + width <= other.left || top >= other.top + other.height || top + height <= other.top);
+      const free = spots.find(isFree) ?? spots[0];
+      taken.push(free);
+      element.style.transform = `translate(${Math.round(free.left)}px, ${Math.round(free.top)}px)`;
     }
   }
 

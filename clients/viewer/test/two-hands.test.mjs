@@ -80,7 +80,7 @@ describe("two hands", () => {
     await feelsBoth(page);
     await page.page.mouse.move(left + 20, top, { steps: 10 });
     await page.says("felt", /First hand, parked: .* back.*Second hand: .* back/s);
-    await page.says("touch", /First hand, parked.*back/);
+    await page.says("touch", /First hand, parked.*back.*jaws/);
     await page.says("touch-other", /Second hand.*back/);
     await page.says("holder", /hold two tools/);
     await page.picture("two-hands");
