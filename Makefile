@@ -16,7 +16,7 @@ XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 
 PACKAGES := deb wheel npm crates library image helm unity unreal
 
-.PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states film scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-solid bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python chaos site
 
@@ -54,6 +54,7 @@ help:
 	@echo 'make site            the guide as a site with search, target/site/index.html; fails on a broken link or a missing picture'
 	@echo 'make screenshot      the screenshot of the README'
 	@echo 'make page-states     a picture of each state of the page, at three widths, light and dark, in target/viewer/states'
+	@echo 'make film            pictures and a film of two hands on the page: one lifts a gallbladder, one strokes it; target/viewer/two-hands'
 	@echo 'make scene-pictures  the pictures of the scenes in the list of the page'
 	@echo 'make bench-roundtrip the haptic round trip compared with a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
@@ -203,6 +204,9 @@ screenshot: build viewer
 # `make page-states STATES=first,lost WIDTHS=390`: some only.
 page-states: build viewer
 	cd $(VIEWER) && $(NPM) run states
+
+film: build viewer
+	cd $(VIEWER) && $(NPM) run film
 
 scene-pictures: build viewer
 	cd $(VIEWER) && $(NPM) run scene-pictures

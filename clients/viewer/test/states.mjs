@@ -77,6 +77,21 @@ const STATES = {
     await page.page.waitForTimeout(2500);
     return { page };
   },
+  "two-hands": async (context) => {
+    const page = await shown(context, "?scene=gallbladder&tool=grasper,stroke&name=Ann");
+    const [left, top] = await page.press(0.45, 0.48);
+    await page.until(({ hands: { both } }) => (both[0]?.forceN ?? 0) > 1e-3);
+    await page.page.mouse.down({ button: "right" });
+    await page.until(({ hands: { both } }) => both[0]?.grips);
+    await page.page.mouse.move(left, top - 40, { steps: 6 });
+    await page.page.keyboard.press("p");
+    await page.page.mouse.up({ button: "right" });
+    await page.page.mouse.up();
+    await page.press(0.25, 0.42);
+    await page.until(({ hands: { both } }) => (both[1]?.forceN ?? 0) > 1e-3);
+    await page.page.waitForTimeout(2500);
+    return { page };
+  },
   lumps: async (context) => {
     const page = await shown(context, "");
     await page.page.check("#lumps");
