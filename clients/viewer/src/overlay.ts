@@ -116,13 +116,15 @@ export class Overlay {
       const [width, height] = [element.offsetWidth, element.offsetHeight];
       const within = (v: number, most: number) => Math.min(Math.max(v, 8), most - 8);
       const spot = (left: number, top: number) => ({ left: within(left, view.width - width), top: within(top, view.height - height), width, height });
-      // To the left of the tool, which comes from the right; if there is no room, to the right and below, or above.
+      // To the left of the tool, which comes from the right; if there is no room, to the right and below, or above,
+      // or below the other text.
       const lefts = x - BESIDE - width > 8 ? [spot(x - BESIDE - width, y - height / 2), spot(x - BESIDE - width, y - height - BESIDE / 2)] : [];
-      const spots = [...lefts, spot(x + BESIDE, y + BESIDE / 2), spot(x + BESIDE, y - height - BESIDE / 2)] as const;
+      const below = taken.map((other) => spot(x + BESIDE, other.top + other.height + 4));
+      const spots = [...lefts, spot(x + BESIDE, y + BESIDE / 2), spot(x + BESIDE, y - height - BESIDE / 2), ...below] as const;
       const isFree = ({ left, top }: { left: number; top: number }) =>
         shown.every((other) => other.tool === tool || !(other.x > left - NEAR && other.x < left + width + NEAR && other.y > top - NEAR && other.y < top + height + NEAR)) &&
         taken.every((other) => left >= other.left + other.width || left + width <= other.left || top >= other.top + other.height || top + height <= other.top);
-      const free = spots.find(isFree) ?? spots[0];
+      const free = spots.find(isFree) ?? spots[0]!;
       taken.push(free);
       element.style.transform = `translate(${Math.round(free.left)}px, ${Math.round(free.top)}px)`;
     }
