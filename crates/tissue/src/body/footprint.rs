@@ -28,6 +28,9 @@ const MIN_FREE_PART: f64 = 0.25;
 /// If movable points carry less than this part of a disc, it lies on fixed points and moves nothing.
 const FIXED_PART: f64 = 0.02;
 
+/// A disc that seeks on a curved surface is where it should be within this part of its radius.
+const BESIDE: f64 = 1.0 / 256.0;
+
 /// The disc with which a tool touches a tissue, at a place of the tissue at rest: the points that it covers and their
 /// weights. It belongs to the model that it was created for; its functions must get the same.
 #[derive(Debug)]
@@ -152,10 +155,16 @@ impl Footprint {
     }
 
     /// Moves the disc of a tool that touches nothing to the place of the displaced surface nearest to
-    /// `place_m`, or towards it. This converges if the surface is not folded.
-    pub(crate) fn seek(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
+    /// `place_m`, or towards it. This converges if the surface is not folded. `leaps`: another part of a curved surface may be nearer.
+    pub(crate) fn seek(
+        &mut self,
+        model: &Model,
+        place_m: DVec3,
+        leaps: bool,
+        displacement_m: impl Fn([usize; 2]) -> DVec3,
+    ) {
         let of_point = |point| displacement_m(model.point_of(model.place_of(point)));
-        if self.disc.leap(place_m, &of_point) {
+        if leaps && self.disc.leap(place_m, &of_point) {
             self.lay(model);
         }
         for _ in 0..2 {
@@ -167,6 +176,9 @@ impl Footprint {
                 beside_m -= beside_m.dot(outward) * outward;
                 // Far from a curved surface, a whole step would lead past the place.
                 beside_m *= self.radius_m / (self.radius_m + away_m + beside_m.length());
+                if beside_m.length() < BESIDE * self.radius_m {
+                    return;
+                }
             }
             self.shift(model, beside_m, &along);
         }

@@ -106,6 +106,11 @@ impl Plan {
         Plan::new(self.integrator, self.substeps * by, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
     }
 
+    /// Returns whether the substep that ends at `fraction` of a step is its first one.
+    pub(crate) fn is_first(&self, fraction: f64) -> bool {
+        fraction * f64::from(self.substeps) < 1.5
+    }
+
     /// Returns the work of a force of 1 in the fields of the tools along a displacement of 1, J.
     pub(crate) fn unit_of_work_j(&self, model: &Model) -> f64 {
         model.unit_m / (self.scheme.impulse() * self.force_scale(&model.scene))
@@ -339,6 +344,7 @@ impl Model {
 }
 
 /// Returns the displacement of a point from rest, m. For a multistep scheme, it is the predicted one.
+#[inline]
 pub(crate) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
     let at = i * layout.stride + j;
     let component = |c: usize| state.u[c * layout.plane + at].wide() * model.unit_m;

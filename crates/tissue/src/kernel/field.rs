@@ -76,9 +76,11 @@ impl<T: Real> State<T> {
     }
 
     /// Adds a change to u and d of a point, with a factor for each.
+    #[inline]
     pub(crate) fn add(&mut self, layout: &Layout, [i, j]: [usize; 2], change: [f64; 3], [of_u, of_d]: [f64; 2]) {
+        let first = i * layout.stride + j;
         for (c, change) in change.into_iter().enumerate() {
-            let at = c * layout.plane + i * layout.stride + j;
+            let at = c * layout.plane + first;
             self.u[at] += T::of(of_u * change);
             self.d[at] += T::of(of_d * change);
         }

@@ -137,7 +137,7 @@ impl Tool {
         if was_pressing {
             tiles.wake_under(rigid.points());
         } else {
-            self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
+            self.seek(model, layout, state, place_m, plan.is_first(fraction));
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         let outward = self.footprint.outward(&along);

@@ -72,6 +72,9 @@ const RELAXATION: f64 = 1.0 / 64.0;
 /// A disc's lag behind its tool counts from this part of its radius on. On a smooth surface there is none.
 const MIN_LAG: f64 = 1.0 / 64.0;
 
+/// A tool is high above the tissue from this part of its radius on.
+const HIGH: f64 = 0.5;
+
 /// A disc continues to slide while its mean normal, taken perpendicular to its path, has at least this part
 /// along the normal at its place.
 const MIN_STRAIGHTNESS: f64 = 0.9;
@@ -271,7 +274,7 @@ pub(crate) fn push<T: Real>(
 ) {
     let scale = plan.force_scale(&model.scene);
     for WeightedNode { point, mass, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
-        state.add(layout, point, force_n.to_array().map(|force_n| scale * weight * force_n / mass), of);
+        state.add(layout, point, (scale * weight * force_n / mass).to_array(), of);
     }
 }
 
@@ -372,7 +375,7 @@ impl Tool {
         let ToolSubstep { mut place_m, spread_n, .. } = leg;
         let before = self.contact_state;
         if self.contact_state == ContactState::Free {
-            self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
+            self.seek(model, layout, state, place_m, leg.is_first);
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         let outward = self.footprint.outward(&along);
@@ -473,6 +476,27 @@ impl Tool {
         thrust
     }
 
+    /// Moves the disc of a tool that touches nothing to where the tool would meet the tissue. While a tool is high above its
+    /// disc, it does this in the first substep of each step only: it is most of what such a tool costs.
+    pub(crate) fn seek<T: Real>(
+        &mut self,
+        model: &Model,
+        layout: &Layout,
+        state: &State<T>,
+        place_m: DVec3,
+        is_first: bool,
+    ) {
+        let displacement_m = |point| displacement_m(model, layout, state, point);
+        if let Some(side) = self.side.filter(|_| !self.is_new && !is_first) {
+            let (surface_m, along) = self.footprint.surface(displacement_m);
+            let above_m = side * (place_m - surface_m).dot(self.footprint.outward(&along));
+            if above_m - self.tip.shape.height_m(self.tip.radius_m) > HIGH * self.tip.radius_m {
+                return;
+            }
+        }
+        self.footprint.seek(model, place_m, self.is_new || is_first, displacement_m);
+    }
+
     /// Returns the part of a gap perpendicular to a normal if a constraint would close it and it is too large
     /// for a disc that follows its tool, m; otherwise 0.
     fn lag_m(&self, gap_m: DVec3, normal: DVec3) -> DVec3 {
@@ -492,6 +516,7 @@ impl Tool {
         let met = self.contact_state != ContactState::Free;
         let mut leg = ToolSubstep {
             place_m: self.place_m(fraction),
+            is_first: plan.is_first(fraction),
             normal: met.then_some(self.normal),
             reference: None,
             jump_n: DVec3::ZERO,
@@ -506,7 +531,7 @@ impl Tool {
         let jump_n = of_u / (of_d * moves_m_per_n) * jump_m;
         let pressing_n = jump_n.dot(self.normal) * self.normal;
         let (across_n, substeps) = (jump_n - pressing_n, f64::from(plan.substeps));
-        let is_first = fraction * substeps < 1.5;
+        let is_first = leg.is_first;
         leg.spread_n = pressing_n / substeps;
         // A sliding disc takes no more of the part along the surface than friction allows.
         if self.contact_state == ContactState::Sticking {
@@ -690,6 +715,8 @@ impl Tool {
 pub(crate) struct ToolSubstep {
     /// Place at the substep's end, m.
     place_m: DVec3,
+    /// Whether it is the first one of its step.
+    is_first: bool,
     /// Normal of the surface at the substep's beginning, if the tool touches there.
     normal: Option<DVec3>,
     /// Normal at the time of the gap that the tool keeps; `None` for a new tool.

@@ -57,8 +57,11 @@ const CONTACT_STIFFNESS: f64 = 6.0;
 const TO_CORE: f64 = 0.6;
 const LARGEST_PART: f64 = 0.95;
 
-/// Sweeps over the samples in a substep. Forces change little from one substep to the next, so that a few suffice.
+/// Most sweeps over the samples in a substep. Forces change little from one substep to the next, so that a few suffice.
 const SWEEPS: usize = 8;
+
+/// The sweeps end when none has changed a force by more than this part of the largest one.
+const SETTLED: f64 = 1e-5;
 
 /// Samples are at most this part of the radius apart, and at most a cell.
 const SPACING: f64 = 0.35;
@@ -84,7 +87,7 @@ const FACING_WHOLLY: f64 = 0.2;
 const FIXED_PART: f64 = 1e-3;
 
 /// Time of a sample that is touched, in a substep, divided by that of looking up one triangle of a disc of even pressure.
-const LOOKUPS_PER_SAMPLE: f64 = 100.0;
+const LOOKUPS_PER_SAMPLE: f64 = 50.0;
 
 /// Returns the time of a substep with a rigid tip of `radius_m` (m) on cells of `edge_m` (m), in triangles that a disc of even
 /// pressure would look up.
@@ -191,8 +194,9 @@ pub(crate) struct RigidTip {
     steady_n: Vec<DVec3>,
     /// Σ w·ΔF/mass at each point, N, for the masses relative to the reference mass.
     change_n: Vec<DVec3>,
-    /// Displacement of each point, m; kept, so that a step allocates nothing.
+    /// Displacement of each point, m, and its movement in the substep, spacings; kept, so that a step allocates nothing.
     displacements_m: Vec<DVec3>,
+    movements: Vec<DVec3>,
     touched: Vec<TouchedSample>,
 }
 
@@ -212,6 +216,7 @@ impl RigidTip {
             steady_n: Vec::new(),
             change_n: Vec::new(),
             displacements_m: Vec::new(),
+            movements: Vec::new(),
             touched: Vec::new(),
         }
     }
@@ -340,7 +345,8 @@ impl RigidTip {
         let nodes: Arc<[TouchedPoint]> = places.iter().map(|place| node(*place)).collect();
         let sample = |sample: &SurfaceSample| {
             let number = |point: u32| places.partition_point(|place| *place < place_of(&point)) as u32;
-            let numbers = sample.cell.points.map(number);
+            let mut numbers = [0; 8];
+            numbers.iter_mut().zip(sample.cell.points).for_each(|(of, point)| *of = number(point));
             let weights = sample.cell.weights;
             let parts =
                 numbers.iter().zip(&weights).map(|(node, weight)| weight * weight * nodes[*node as usize].inverse_mass);
@@ -541,11 +547,24 @@ impl RigidTip {
         let (axis, to_core_m) = (*axis, to_core_m(&self.tip));
         self.displacements_m.clear();
         self.displacements_m.extend(nodes.iter().map(|node| displacement_m(model, layout, state, node.point)));
+        self.movements.clear();
+        self.movements.extend(nodes.iter().map(|node| {
+            let [i, j] = node.point;
+            let component = |c: usize| state.d[c * layout.plane + i * layout.stride + j].wide();
+            DVec3::new(component(0), component(1), component(2))
+        }));
         self.touched.clear();
         for (number, sample) in samples.iter().enumerate() {
             let force_n = self.forces_n[number];
             let moved_m = sample.mean(|node| self.displacements_m[node]);
             let from_m = sample.rest_m + moved_m - place_m;
+            let is_within = match shape {
+                TipShape::Sphere => from_m.length_squared() < radius_m * radius_m,
+                TipShape::RigidDisc | TipShape::Disc => from_m.dot(axis) > 0.0,
+            };
+            if !is_within && force_n == DVec3::ZERO {
+                continue;
+            }
             let (way, deep_m) = match shape {
                 TipShape::Sphere => (from_m.try_normalize().unwrap_or(-axis), radius_m - from_m.length()),
                 TipShape::RigidDisc | TipShape::Disc => (-axis, from_m.dot(axis)),
@@ -557,13 +576,7 @@ impl RigidTip {
             if !touches && force_n == DVec3::ZERO {
                 continue;
             }
-            let movement = |node: usize| {
-                let [i, j] = nodes[node].point;
-                let component = |c: usize| state.d[c * layout.plane + i * layout.stride + j].wide();
-                DVec3::new(component(0), component(1), component(2))
-            };
-            let moves = sample.mean(movement);
-            let slip_m = model.unit_m * moves - own_m;
+            let slip_m = model.unit_m * sample.mean(|node| self.movements[node]) - own_m;
             // At the rim of a disc, or beginning to face a sphere, a sample may come in at any depth: its force begins at 0.
             let whole_n_per_m = model.youngs_modulus_pa() * sample.relative_stiffness_m;
             let enters = force_n == DVec3::ZERO && counted_n_per_m < whole_n_per_m;
@@ -596,6 +609,7 @@ impl RigidTip {
         let (mut held_n, mut sliding_n) = (0.0, 0.0);
         for _ in 0..SWEEPS {
             (held_n, sliding_n) = (0.0, 0.0);
+            let (mut most_n2, mut most_by_n2) = (0.0_f64, 0.0_f64);
             for at in touched.iter() {
                 let sample = &samples[at.sample];
                 let moved_n = sample.mean(|node| change_n[node]);
@@ -622,10 +636,15 @@ impl RigidTip {
                 let force_n = pressing_n * at.way + across_n;
                 let by_n = force_n - now_n;
                 forces_n[at.sample] = force_n;
+                most_n2 = most_n2.max(force_n.length_squared());
+                most_by_n2 = most_by_n2.max(by_n.length_squared());
                 for k in 0..sample.nodes.len() {
                     let node = sample.nodes[k] as usize;
                     change_n[node] += sample.weights[k] * nodes[node].inverse_mass * by_n;
                 }
+            }
+            if most_by_n2 <= SETTLED * SETTLED * most_n2 {
+                break;
             }
         }
         sliding_n > held_n

@@ -44,10 +44,16 @@ pub(crate) struct LinearCells {
     lame: f64,
 }
 
-/// Returns the patterns of a cube.
+/// Returns the patterns of a cube. (A loop: the compiler does not inline `map` of an array into code for other processors.)
 #[inline(always)]
 fn patterns_of(corners: &[DVec3; 8]) -> Patterns<One> {
-    Patterns::of_corners(&corners.map(|corner| corner.to_array().map(Scalar)))
+    let mut values = [[Scalar(0.0); 3]; 8];
+    for corner in 0..8 {
+        for c in 0..3 {
+            values[corner][c] = Scalar(corners[corner][c]);
+        }
+    }
+    Patterns::of_corners(&values)
 }
 
 /// Returns the force on each corner, outward: what resists the displacement that causes it.
@@ -58,7 +64,7 @@ pub(super) fn resisting(stress: &Stress<One>) -> [DVec3; 8] {
         let sides = [stress.on_near_side(c, [Scalar(0.0); 4]), stress.on_far_side(c)];
         for corner in 0..8 {
             let signed = |bit: usize, value: f64| if corner >> bit & 1 == 1 { value } else { -value };
-            let [all, z, x, xz] = sides[corner >> 1 & 1].map(|part| part.0);
+            let [Scalar(all), Scalar(z), Scalar(x), Scalar(xz)] = sides[corner >> 1 & 1];
             forces[corner][c] = all + signed(2, z) + signed(0, x + signed(2, xz));
         }
     }
@@ -119,13 +125,18 @@ impl LinearCells {
         let back = turn.transpose();
         let law = NeoHookean::<f64>::new(*stiffness_n_per_m * *edge_m, *shear, *lame);
         for cell in cells {
-            let corners = cell.points.map(|point| {
+            let mut corners = [DVec3::ZERO; 8];
+            for corner in 0..8 {
+                let point = cell.points[corner];
                 let moved_m = if point == BEYOND { DVec3::ZERO } else { displacement_m[point as usize] };
-                back * moved_m / *edge_m
-            });
+                corners[corner] = back * moved_m / *edge_m;
+            }
             let patterns = patterns_of(&corners);
             let stress = law.stress(Scalar(cell.weight), &patterns);
-            cell.forces_n = resisting(&stress).map(|force_n| *turn * -force_n);
+            let forces = resisting(&stress);
+            for corner in 0..8 {
+                cell.forces_n[corner] = *turn * -forces[corner];
+            }
             let h = &patterns.h;
             let Invariants { cofactor, growth, .. } = Invariants::of(h);
             for i in 0..3 {
@@ -167,10 +178,13 @@ impl LinearCells {
         for cell in &self.cells {
             let c = unit * cell.weight;
             for system in 0..N {
-                let corners: [DVec3; 8] = std::array::from_fn(|corner| {
+                let mut corners = [DVec3::ZERO; 8];
+                for corner in 0..8 {
                     let point = cell.points[corner];
-                    if point == BEYOND { DVec3::ZERO } else { back * x[point as usize][system] }
-                });
+                    if point != BEYOND {
+                        corners[corner] = back * x[point as usize][system];
+                    }
+                }
                 let patterns = patterns_of(&corners);
                 let stress = Stress::of(self.stress(cell, &patterns.h, c), Scalar(c * self.shear), patterns.g);
                 let forces = resisting(&stress);

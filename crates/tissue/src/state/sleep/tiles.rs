@@ -336,12 +336,19 @@ impl<T: Real> SleepTiles<T> {
 
     /// Wakes the tiles that contain the points.
     pub(crate) fn wake_under(&mut self, points: impl IntoIterator<Item = [usize; 2]>) {
+        if self.region.awake.is_full() {
+            return;
+        }
         let layout = self.layout;
         self.wake(points.into_iter().map(|point| tile_of(&layout, point)));
     }
 
     /// Wakes the tile of a point and those that its springs reach in `sweeps` sweeps.
     pub(crate) fn wake_around(&mut self, point: [usize; 2], sweeps: usize) {
+        let is_awake = |tile| self.region.awake.has[tile];
+        if self.region.awake.is_full() || self.graph.reached(point, sweeps).all(is_awake) {
+            return;
+        }
         let graph = self.graph.clone();
         self.wake(graph.reached(point, sweeps));
     }
