@@ -150,7 +150,7 @@ fn jaws_lift_what_is_between_them_by_friction_and_slip_without_it() {
         records
     };
     let [holds, slips] = [0.8, 0.05].map(lifted);
-    let [open, closed, held] = [2, 9, 10].map(|at: usize| holds[at].instruments[0]);
+    let [open, closed, held] = [2, 9, 10].map(|at: usize| &holds[at].instruments[0]);
     assert_eq!(open.force_on_tool_n, [0.0; 3]);
     println!("{held:?}\n{:?}", last(&slips));
     // The tissue pulls the instrument down, opens its jaws, and turns it by nothing.
@@ -176,7 +176,7 @@ fn a_shaft_stays_in_its_port_whose_reaction_balances_the_wrench() {
     let (records, _) = played(&model, text);
     let mut pressed_n = 0.0_f64;
     for record in &records {
-        let [felt] = record.instruments[..] else { panic!("{record:?}") };
+        let [felt] = &record.instruments[..] else { panic!("{record:?}") };
         let place_m = DVec3::from(felt.place_m);
         let [w, x, y, z] = felt.orientation;
         let axis = DQuat::from_xyzw(x, y, z, w) * DVec3::X;
@@ -256,4 +256,34 @@ fn instruments_that_nothing_can_be_are_refused_with_their_place() {
         let refusal = script(&model, &text).unwrap_err().to_string();
         assert!(refusal.contains(expected), "{expected}: {refusal}");
     }
+}
+
+/// Two shafts meet above the tissue, crossed, at 0.1 m/s.
+#[test]
+fn records_tell_the_overlap_of_two_instruments_and_equal_forces_on_both() {
+    let across = text_of(DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2));
+    let text = format!(
+        "duration_s = 0.3\nsample_every_s = 0.01\n[[instrument]]\n\
+         shaft = {{ length_m = 0.03, radius_m = 0.003 }}\n\
+         poses = [{{ at_s = 0, place_m = [0.045, 0.03, 0.05] }}, {{ at_s = 0.2, place_m = [0.045, 0.03, 0.05] }}]\n\
+         [[instrument]]\nshaft = {{ length_m = 0.03, radius_m = 0.003 }}\n\
+         poses = [{{ at_s = 0, place_m = [0.03, 0.045, 0.066], orientation = {across} }}, \
+         {{ at_s = 0.12, place_m = [0.03, 0.045, 0.054], orientation = {across} }}]\n"
+    );
+    let (records, summary) = played(&block(), &text);
+    assert_eq!(summary.guard_events, 0);
+    let mut deepest_m = 0.0_f64;
+    for record in &records {
+        let [lower, upper] = &record.instruments[..] else { continue };
+        let apart_m = upper.place_m[2] - lower.place_m[2];
+        let ([of_lower], [of_upper]) = (&lower.contacts[..], &upper.contacts[..]) else {
+            assert!(lower.contacts.is_empty() && upper.contacts.is_empty() && apart_m >= 0.006 - 1e-12, "{record:?}");
+            continue;
+        };
+        assert_eq!((of_lower.with_instrument, of_upper.with_instrument), (1, 0));
+        assert!((of_lower.depth_m - (0.006 - apart_m)).abs() < 1e-12, "{record:?}");
+        assert!(of_upper.force_n[2] > 0.0 && (of_upper.force_n[2] + of_lower.force_n[2]).abs() < 1e-12, "{record:?}");
+        deepest_m = deepest_m.max(of_lower.depth_m);
+    }
+    assert!((deepest_m - 0.002).abs() < 1e-9, "{deepest_m} m");
 }

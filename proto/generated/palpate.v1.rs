@@ -577,7 +577,7 @@ pub struct TouchOpen {
     /// it.
     #[prost(string, tag = "12")]
     pub lease_id: ::prost::alloc::string::String,
-    /// Samples contain `other_tools`. For a client that steps a copy of the tissue: it feels what the others do without
+    /// Samples contain `other_tools` and `other_instruments`. For a client that steps a copy of the tissue: it feels what the others do without
     /// waiting for the samples of its own tool.
     #[prost(bool, tag = "13")]
     pub other_tools: bool,
@@ -1175,6 +1175,10 @@ pub struct Sample {
     /// The instruments of this stream that have a pose.
     #[prost(message, repeated, tag = "17")]
     pub instruments: ::prost::alloc::vec::Vec<InstrumentSample>,
+    /// With TouchOpen.other_tools: the instruments of other streams of the session, at most 4. Their tips are also among
+    /// `other_tools`, while they are near the tissue.
+    #[prost(message, repeated, tag = "18")]
+    pub other_instruments: ::prost::alloc::vec::Vec<OtherInstrument>,
 }
 impl ::prost::Name for Sample {
     const NAME: &'static str = "Sample";
@@ -1187,7 +1191,7 @@ impl ::prost::Name for Sample {
     }
 }
 /// What an instrument felt at the end of a step: the sum of the forces on its tips.
-#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct InstrumentSample {
     #[prost(uint32, tag = "1")]
     pub first_tool: u32,
@@ -1216,6 +1220,10 @@ pub struct InstrumentSample {
     /// The angle between the jaws at this step.
     #[prost(double, tag = "9")]
     pub jaw_rad: f64,
+    /// Its contacts with other instruments of the session, by ascending `other_tool`. Their forces are not in
+    /// `force_on_tool_n`.
+    #[prost(message, repeated, tag = "10")]
+    pub contacts: ::prost::alloc::vec::Vec<InstrumentContact>,
 }
 impl ::prost::Name for InstrumentSample {
     const NAME: &'static str = "InstrumentSample";
@@ -1225,6 +1233,76 @@ impl ::prost::Name for InstrumentSample {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.InstrumentSample".into()
+    }
+}
+/// Two instruments that overlap. They push each other apart; the server moves neither, because hands lead them.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct InstrumentContact {
+    /// The first tool of the other instrument.
+    #[prost(uint32, tag = "1")]
+    pub other_tool: u32,
+    /// How far they overlap at most, m; above the sum of their radii if the axis of one has passed that of the other.
+    #[prost(double, tag = "2")]
+    pub depth_m: f64,
+    /// Force of the other on this instrument.
+    #[prost(message, optional, tag = "3")]
+    pub force_n: ::core::option::Option<Vector3>,
+    /// Its torque about `about_m`.
+    #[prost(message, optional, tag = "4")]
+    pub torque_n_m: ::core::option::Option<Vector3>,
+}
+impl ::prost::Name for InstrumentContact {
+    const NAME: &'static str = "InstrumentContact";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.InstrumentContact".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.InstrumentContact".into()
+    }
+}
+/// An instrument of another stream at the end of a step, as far as others can touch it.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct OtherInstrument {
+    #[prost(uint32, tag = "1")]
+    pub first_tool: u32,
+    /// At most 8.
+    #[prost(message, repeated, tag = "2")]
+    pub capsules: ::prost::alloc::vec::Vec<Capsule>,
+}
+impl ::prost::Name for OtherInstrument {
+    const NAME: &'static str = "OtherInstrument";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.OtherInstrument".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.OtherInstrument".into()
+    }
+}
+/// A row of tips: all places within a radius of the segment between two ends.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Capsule {
+    #[prost(message, optional, tag = "1")]
+    pub from_m: ::core::option::Option<Vector3>,
+    #[prost(message, optional, tag = "2")]
+    pub to_m: ::core::option::Option<Vector3>,
+    /// Velocities of both ends.
+    #[prost(message, optional, tag = "3")]
+    pub from_velocity_m_per_s: ::core::option::Option<Vector3>,
+    #[prost(message, optional, tag = "4")]
+    pub to_velocity_m_per_s: ::core::option::Option<Vector3>,
+    #[prost(double, tag = "5")]
+    pub radius_m: f64,
+}
+impl ::prost::Name for Capsule {
+    const NAME: &'static str = "Capsule";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Capsule".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Capsule".into()
     }
 }
 /// What the port of an instrument and the hand at its handle exert.

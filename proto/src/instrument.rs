@@ -2,10 +2,12 @@
 
 use glam::DQuat;
 use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::instrument_contact::MAX_CAPSULES;
 use palpate_haptics::instrument_pose::MAX_JAW_RAD;
 use palpate_haptics::port::HANDLE_M;
 use palpate_haptics::{
-    Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Port, Wrench, WrenchSample,
+    Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, MotionState,
+    MovingCapsule, OtherInstrument, Port, Wrench, WrenchSample,
 };
 
 use crate::geometry::{from_vector, vector};
@@ -92,6 +94,38 @@ pub fn instrument(instrument: &Instrument, first_tool: u32) -> pb::Instrument {
         hinge_m: vector(instrument.hinge_m),
         port: instrument.port.map(|port| pb::Port { position_m: vector(port.place_m), handle_m: port.handle_m }),
     }
+}
+
+/// Converts an instrument of another stream to a message. Its time is that of the sample.
+pub fn other_instrument(other: &OtherInstrument) -> pb::OtherInstrument {
+    let capsule = |MovingCapsule { ends: [from, to], radius_m }: &MovingCapsule| pb::Capsule {
+        from_m: vector(from.place_m),
+        to_m: vector(to.place_m),
+        from_velocity_m_per_s: vector(from.velocity_m_per_s),
+        to_velocity_m_per_s: vector(to.velocity_m_per_s),
+        radius_m: *radius_m,
+    };
+    pb::OtherInstrument {
+        first_tool: other.first_tool,
+        capsules: other.capsules.iter().flatten().map(capsule).collect(),
+    }
+}
+
+/// Returns the instrument of another stream in a message, at the time `time_s` of the client's clock, s. Absent vectors become 0.
+/// Leaves out what is beyond [`MAX_CAPSULES`]. Its numbers may be anything ([`OtherInstrument::is_sound`]).
+pub fn from_other_instrument(message: &pb::OtherInstrument, time_s: f64) -> OtherInstrument {
+    let end = |place_m: &Option<pb::Vector3>, velocity_m_per_s: &Option<pb::Vector3>| MotionState {
+        time_s,
+        place_m: from_vector(place_m.as_ref()),
+        velocity_m_per_s: from_vector(velocity_m_per_s.as_ref()),
+    };
+    let mut capsules = [None; MAX_CAPSULES];
+    for (place, message) in capsules.iter_mut().zip(&message.capsules) {
+        let pb::Capsule { from_m, to_m, from_velocity_m_per_s, to_velocity_m_per_s, radius_m } = message;
+        let ends = [end(from_m, from_velocity_m_per_s), end(to_m, to_velocity_m_per_s)];
+        *place = Some(MovingCapsule { ends, radius_m: *radius_m });
+    }
+    OtherInstrument { first_tool: message.first_tool, capsules }
 }
 
 /// Returns the pose of an instrument in a message, and its velocity if it has one.

@@ -36,6 +36,7 @@ mod request;
 mod revocation;
 mod serve;
 mod services;
+mod session_instruments;
 mod sessions;
 pub mod signals;
 mod status;

@@ -27,6 +27,7 @@ use super::listeners::{Listeners, ServeError};
 use super::meshes::Meshes;
 use super::revocation::Calls;
 use super::services::Services;
+use super::session_instruments::SessionInstruments;
 use super::textures::Textures;
 use super::traffic::Traffic;
 use super::{admin, connections, descriptors, haptics, metrics, nodes, page, sessions, textures, views};
@@ -192,6 +193,7 @@ async fn run(
         job_pool: job_pool.clone(),
         traffic: traffic.clone(),
         recorded: recorded.clone(),
+        instruments: SessionInstruments::default(),
         fleet: fleet.clone(),
     };
 

@@ -9,6 +9,7 @@ use super::fleet::Fleet;
 use super::job_pool::JobPool;
 use super::journals::recorded::Recorded;
 use super::meshes::Meshes;
+use super::session_instruments::SessionInstruments;
 use super::status;
 use super::textures::Textures;
 use super::traffic::Traffic;
@@ -29,6 +30,7 @@ pub(crate) struct Services {
     pub(crate) job_pool: JobPool,
     pub(crate) traffic: Arc<Traffic>,
     pub(super) recorded: Arc<Recorded>,
+    pub(super) instruments: SessionInstruments,
     /// The fleet that this server belongs to, if any.
     pub(super) fleet: Option<Arc<Fleet>>,
 }

@@ -158,6 +158,7 @@ export class Hand {
 
   /** Begins to touch at `place`, which is now at `onSurfaceM`. */
   async press(place: Place, onSurfaceM: Vec3, view: View): Promise<void> {
+    this.isLeft = false;
     this.place = place;
     this.onSurfaceM = onSurfaceM;
     this.leanM = [0, 0, 0];

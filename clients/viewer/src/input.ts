@@ -96,8 +96,8 @@ export class Input {
   /** While a pointer leads one hand, another one leads the other. Returns false if it is beside the tissue, or neither is free. */
   private beginBeside(hands: Hands, event: PointerEvent): boolean {
     const free = [hands.chosen, hands.other].find((hand) => typeof this.drags.get(hand)?.leader !== "number");
-    const place = free && this.stage.pick(event.clientX, event.clientY);
-    if (place) this.lead(free, place, event);
+    const place = free && event.button === 0 ? this.stage.pick(event.clientX, event.clientY) : undefined;
+    if (place && free) this.lead(free, place, event);
     return place !== undefined;
   }
 

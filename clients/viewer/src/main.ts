@@ -607,8 +607,11 @@ stage.onDrawn = () => {
 // A hidden window releases its connections for visible ones.
 document.addEventListener("visibilitychange", () => {
   player.look(!document.hidden);
-  if (document.hidden) shownSession?.lookAway();
-  else shownSession?.look();
+  if (document.hidden) {
+    shownSession?.lookAway();
+    // Timers of a hidden window are too rare to lead a tool.
+    void shownSession?.hands.letGo();
+  } else shownSession?.look();
 });
 addEventListener("pagehide", () => {
   server.leave();

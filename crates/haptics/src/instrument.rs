@@ -9,6 +9,7 @@
 
 use glam::{DQuat, DVec3};
 
+use crate::capsule::Capsule;
 use crate::instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
 use crate::port::{Port, PortLoad};
 use crate::tip::{Tip, TipShape};
@@ -95,6 +96,34 @@ impl Instrument {
         let gaps = ((from_m.distance(to_m) / tip.radius_m).ceil() as usize).min(MAX_TIPS);
         let offsets_m = (0..=gaps).map(|at| from_m.lerp(to_m, at as f64 / gaps.max(1) as f64));
         self.tips.extend(offsets_m.map(|offset_m| InstrumentTip { offset_m, tip, part }));
+    }
+
+    /// Returns the first and the last tip of each row of tips: tips of one part and radius that follow each other on a straight line,
+    /// at most a radius apart. Each row is a capsule; a tip beside which there is no other is a row of its own.
+    pub fn rows(&self) -> Vec<[usize; 2]> {
+        let mut rows: Vec<[usize; 2]> = Vec::new();
+        for (number, tip) in self.tips.iter().enumerate() {
+            let goes_on = |row: &[usize; 2]| {
+                let [first, last] = row.map(|tip| &self.tips[tip]);
+                let way_m = tip.offset_m - last.offset_m;
+                let before = (last.offset_m - first.offset_m).try_normalize();
+                let is_straight = before.is_none_or(|before| before.dot(way_m) >= (1.0 - 1e-9) * way_m.length());
+                let radius_m = tip.tip.radius_m;
+                (tip.part, radius_m) == (last.part, last.tip.radius_m)
+                    && way_m.length() <= (1.0 + 1e-9) * radius_m
+                    && is_straight
+            };
+            match rows.last_mut().filter(|row| goes_on(row)) {
+                Some(row) => row[1] = number,
+                None => rows.push([number; 2]),
+            }
+        }
+        rows
+    }
+
+    /// Returns the capsule of a row ([`Instrument::rows`]) at a pose. Panics if there is no such tip.
+    pub fn capsule(&self, row: [usize; 2], pose: &InstrumentPose) -> Capsule {
+        Capsule { ends_m: row.map(|tip| self.tip_m(tip, pose)), radius_m: self.tips[row[0]].tip.radius_m }
     }
 
     /// Returns where the instrument is if a hand leads it to a pose: with a port, its shaft passes through that ([`Port::lead`]).

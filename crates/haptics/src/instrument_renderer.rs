@@ -10,12 +10,19 @@
 //! While there is no copy, or it has no answer, the last wrench is kept: the envelope counts the time since the last wrench of the
 //! copy as the age of the model, so the wrench fades and rendering pauses.
 //!
+//! **Contact.** Instruments push each other apart ([`crate::instrument_contact`]). This is computed here, in each tick, from where the
+//! others are: the instrument of the same client's second hand at once, and those of other clients by samples. The two hands of a client
+//! have one account: what one gives to their contact, by the force that its device renders, may leave the port of the other
+//! ([`Envelope::supply`]); jaws that close on the other give nothing. What another client gives may not leave: over a delay, each would
+//! take the other's late push for energy.
+//!
 //! **Port.** An instrument in a port follows the place of the device and its turn about the shaft ([`crate::port`]). The device gets
 //! the wrench with the same power for each of its own movements ([`Port::on_device`]), and the envelope counts these.
 
 use crate::envelope::{Envelope, RenderingState, Wanted, WantedTurn};
+use crate::instrument::Instrument;
+use crate::instrument_contact::{InstrumentContact, MAX_OTHER_INSTRUMENTS, OtherInstrument, SecondHand};
 use crate::instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
-use crate::port::Port;
 use crate::prediction::{MAX_OTHERS, OtherTool, Prediction, replace_others};
 use crate::renderer::BIAS_S;
 use glam::DVec3;
@@ -55,8 +62,19 @@ impl WrenchSample {
 #[derive(Debug)]
 pub struct InstrumentRenderer {
     prediction: Option<Prediction>,
-    port: Option<Port>,
+    instrument: Instrument,
     others: Vec<OtherTool>,
+    /// The second hand, and the instruments of other clients.
+    second: Option<SecondHand>,
+    other_instruments: Vec<OtherInstrument>,
+    contact: InstrumentContact,
+    /// What the second hand had given at the last tick, J.
+    taken_j: f64,
+    /// Where the device was at the last tick, and what it has rendered of the second hand since; and what it has given to that, J.
+    pushed: Option<(InstrumentPose, Wrench)>,
+    given_j: f64,
+    /// How far it overlaps with others, m.
+    overlap_m: f64,
     /// The newest sample in use, one that waits for the next tick with its arrival, s, and the arrival of the newest, s.
     newest: Option<WrenchSample>,
     arrived: Option<(WrenchSample, f64)>,
@@ -77,12 +95,19 @@ pub struct InstrumentRenderer {
 
 impl InstrumentRenderer {
     /// Creates a renderer without a copy, which renders nothing until it has one ([`InstrumentRenderer::predict`]) and a sample has
-    /// been compared with it. `port`: that of the instrument. The wrench passes through `envelope`.
-    pub fn new(envelope: Envelope, port: Option<Port>) -> Self {
+    /// been compared with it. The wrench passes through `envelope`.
+    pub fn new(envelope: Envelope, instrument: Instrument) -> Self {
         InstrumentRenderer {
             prediction: None,
-            port,
+            contact: InstrumentContact::new(&instrument),
+            instrument,
             others: Vec::with_capacity(MAX_OTHERS),
+            second: None,
+            other_instruments: Vec::with_capacity(MAX_OTHER_INSTRUMENTS),
+            taken_j: 0.0,
+            pushed: None,
+            given_j: 0.0,
+            overlap_m: 0.0,
             newest: None,
             arrived: None,
             newest_s: None,
@@ -108,10 +133,21 @@ impl InstrumentRenderer {
         replace_others(&mut self.others, others);
     }
 
+    /// Replaces what is known of other instruments: this client's second hand, and up to [`MAX_OTHER_INSTRUMENTS`] of other
+    /// clients. Leaves out what is not sound.
+    pub fn follow_instruments(&mut self, second: Option<SecondHand>, others: &[OtherInstrument]) {
+        self.second = second.filter(|second| second.instrument.is_sound() && second.given_j.is_finite());
+        self.other_instruments.clear();
+        let sound = others.iter().filter(|other| other.is_sound());
+        self.other_instruments.extend(sound.take(MAX_OTHER_INSTRUMENTS));
+    }
+
     /// Forgets the samples for a new connection. The copy stays set: also call [`InstrumentRenderer::predict`].
     pub fn begin(&mut self) {
-        (self.newest, self.arrived) = (None, None);
+        (self.newest, self.arrived, self.second) = (None, None, None);
         self.others.clear();
+        self.other_instruments.clear();
+        self.contact.forget();
     }
 
     /// Receives a sample that arrived at `now_s`, s, by the clock of [`InstrumentRenderer::tick`]. It takes effect at the next tick. One
@@ -140,9 +176,12 @@ impl InstrumentRenderer {
                 self.velocity.angular_rad_per_s = turned_rad / elapsed_s;
             }
         }
-        let led = self.port.map_or(*pose, |port| port.lead(pose));
+        let led = self.instrument.lead(pose);
+        let mut pushed = [Wrench::default(); 2];
+        self.overlap_m = 0.0;
         if is_known {
             self.before = Some((now_s, *pose));
+            pushed = self.touch(now_s, &led);
             if let Some(prediction) = &mut self.prediction {
                 self.envelope.supply(prediction.move_to(now_s, &led, &self.others));
             }
@@ -163,13 +202,67 @@ impl InstrumentRenderer {
         let known_s = self.newest_s.zip(self.answered_s).map(|(newest_s, answered_s)| newest_s.min(answered_s));
         let age_s = known_s.filter(|_| counts).map(|known_s| now_s - known_s);
         let InstrumentVelocity { velocity_m_per_s, angular_rad_per_s, .. } = self.velocity;
-        let Wrench { force_n, torque_n_m } = self.port.map_or(self.last, |port| port.on_device(pose, &self.last));
+        let wanted = self.last + pushed[0] + pushed[1];
+        let on_device = self.instrument.port.map_or(wanted, |port| port.on_device(pose, &wanted));
+        let Wrench { force_n, torque_n_m } = on_device;
         // An orientation that is not finite is as bad as such a place.
         let place_m = if is_known { pose.place_m } else { DVec3::NAN };
-        self.envelope.render_wrench(
+        let rendered = self.envelope.render_wrench(
             &Wanted { now_s, place_m, velocity_m_per_s, force_n, age_s },
             &WantedTurn { torque_n_m, angular_rad_per_s, turned_rad },
-        )
+        );
+        if is_known {
+            // The envelope may have shortened it, and the device may render no torque.
+            let part = |rendered: DVec3, wanted: DVec3| {
+                (rendered.dot(wanted) / wanted.length_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0)
+            };
+            let second = self.instrument.port.map_or(pushed[0], |port| port.on_device(pose, &pushed[0]));
+            let second = Wrench {
+                force_n: part(rendered.force_n, force_n) * second.force_n,
+                torque_n_m: part(rendered.torque_n_m, torque_n_m) * second.torque_n_m,
+            };
+            self.give(pose, second);
+        }
+        rendered
+    }
+
+    /// Returns the wrenches of the second hand and of other instruments at a pose, about its place.
+    fn touch(&mut self, now_s: f64, led: &InstrumentPose) -> [Wrench; 2] {
+        self.contact.begin();
+        let mut wrenches = [Wrench::default(); 2];
+        let second = self.second.iter().map(|second| (0, &second.instrument));
+        for (whose, other) in second.chain(self.other_instruments.iter().map(|other| (1, other))) {
+            let capsules = other.capsules.iter().flatten().map(|capsule| capsule.at(now_s));
+            if let Some(load) = self.contact.feel(&self.instrument, led, other.first_tool, capsules) {
+                wrenches[whose] = wrenches[whose] + load.wrench;
+                self.overlap_m = self.overlap_m.max(load.depth_m);
+            }
+        }
+        if let Some(second) = &self.second {
+            self.envelope.supply(second.given_j - std::mem::replace(&mut self.taken_j, second.given_j));
+        }
+        wrenches
+    }
+
+    /// Adds the work on the second hand over the device's way to a pose, from which on the device renders `wrench` of that contact.
+    fn give(&mut self, pose: &InstrumentPose, wrench: Wrench) {
+        if let Some((from, rendered)) = self.pushed.replace((*pose, wrench)) {
+            self.given_j -=
+                rendered.force_n.dot(pose.place_m - from.place_m) + rendered.torque_n_m.dot(from.turn_to(pose));
+        }
+    }
+
+    /// Returns this hand, with its instrument at a pose of [`Instrument::lead`] at `now_s`, s, as the second hand of another renderer.
+    pub fn as_second_hand(&self, first_tool: u32, led: &InstrumentPose, now_s: f64) -> SecondHand {
+        let (rows, velocity) = (self.contact.rows(), InstrumentVelocity::default());
+        let instrument = OtherInstrument::of(first_tool, &self.instrument, rows, led, &velocity, now_s);
+        SecondHand { instrument, given_j: self.given_j }
+    }
+
+    /// Returns how far the instrument overlaps with other instruments at the last tick, m: above the sum of two radii if an axis has
+    /// passed another.
+    pub fn overlap_m(&self) -> f64 {
+        self.overlap_m
     }
 
     /// Compares the copy with a sample that has arrived, and keeps the difference from the wrench before as the bias.
@@ -229,8 +322,11 @@ mod tests {
     use super::*;
     use crate::device::Device;
     use crate::envelope::{LimitCause, PAUSE_S};
+    use crate::hand::{Hand, HandState};
+    use crate::instrument::InstrumentPart;
     use crate::local_model::ContactState;
     use crate::prediction::{Predicted, Predictor};
+    use crate::tip::Tip;
 
     const TICK_S: f64 = 1e-3;
 
@@ -274,7 +370,7 @@ mod tests {
         fn new(factor: f64) -> Self {
             let mut envelope = Envelope::new(Device::named("sigma7").unwrap(), DVec3::ZERO);
             envelope.enable();
-            let mut renderer = InstrumentRenderer::new(envelope, None);
+            let mut renderer = InstrumentRenderer::new(envelope, Instrument::default());
             let is_off = Arc::new(AtomicBool::new(false));
             renderer.predict(Some(Prediction::new(Box::new(TurningCopy { factor, is_off: is_off.clone() }))));
             Loop { renderer, is_off, tick: 0 }
@@ -384,5 +480,132 @@ mod tests {
         let energy_j = each.renderer.envelope.energy_j();
         assert!(put_in_j > 1e-3 && energy_j > -3e-4, "{put_in_j} J, then {energy_j} J");
         assert!(each.renderer.envelope.count(LimitCause::Passivity).0 > 0);
+    }
+
+    /// One of two hands: a mass in a grip that follows a target, with an instrument that is all it feels.
+    struct PushingHand {
+        renderer: InstrumentRenderer,
+        hand: Hand,
+        state: HandState,
+        pose: InstrumentPose,
+        deepest_m: f64,
+        least_j: f64,
+        most_n: f64,
+    }
+
+    impl PushingHand {
+        fn new(device: &str, hand: &str, pose: InstrumentPose) -> Self {
+            let mut instrument = Instrument::default();
+            let tip = Tip { radius_m: 0.003, ..Tip::default() };
+            instrument.add_row(DVec3::ZERO, -0.06 * DVec3::X, tip, InstrumentPart::Body);
+            let mut envelope = Envelope::new(Device::named(device).unwrap(), DVec3::ZERO);
+            envelope.enable();
+            let mut renderer = InstrumentRenderer::new(envelope, instrument);
+            let copy = TurningCopy { factor: 0.0, is_off: Arc::default() };
+            renderer.predict(Some(Prediction::new(Box::new(copy))));
+            let state = HandState { place_m: pose.place_m, velocity_m_per_s: DVec3::ZERO };
+            let hand = Hand::named(hand).unwrap();
+            PushingHand { renderer, hand, state, pose, deepest_m: 0.0, least_j: 0.0, most_n: 0.0 }
+        }
+
+        fn seen(&self, first_tool: u32, now_s: f64) -> SecondHand {
+            self.renderer.as_second_hand(first_tool, &self.pose, now_s)
+        }
+
+        /// Goes on for a tick towards a target that moves.
+        fn tick(&mut self, tick: u32, [from_m, to_m]: [DVec3; 2], other: SecondHand, is_second: bool) {
+            let now_s = f64::from(tick) * TICK_S;
+            let sample = WrenchSample {
+                sequence: tick.into(),
+                client_time_s: now_s,
+                pose: self.pose,
+                wrench: Wrench::default(),
+            };
+            self.renderer.receive(sample, now_s);
+            let second = is_second.then_some(other);
+            let others = if is_second { &[][..] } else { &[other.instrument] };
+            self.renderer.follow_instruments(second, others);
+            let force_n = self.renderer.tick(now_s, &self.pose).force_n;
+            let string_n = self.hand.string_n(from_m, self.state.place_m);
+            self.state = self.hand.advance(self.state, from_m, to_m, force_n + string_n, TICK_S);
+            self.pose.place_m = self.state.place_m;
+            self.deepest_m = self.deepest_m.max(self.renderer.overlap_m());
+            self.least_j = self.least_j.min(self.renderer.envelope.energy_j());
+            self.most_n = self.most_n.max(force_n.length());
+        }
+    }
+
+    /// Two hands push their instruments together, each at 0.05 m/s, until their targets are 16 mm beyond each other, and go back; or
+    /// nobody holds the upper one, and it does not move by itself. The poses are of the instruments when they just touch.
+    fn push([lower, upper]: [InstrumentPose; 2], is_second: bool, is_held: bool) -> [PushingHand; 2] {
+        let apart =
+            |pose: InstrumentPose, by_m: f64| InstrumentPose { place_m: pose.place_m + by_m * DVec3::Z, ..pose };
+        let upper_hand = if is_held { "medium" } else { "none" };
+        let starts = [apart(lower, -0.01), apart(upper, 0.01)];
+        let mut hands =
+            [PushingHand::new("sigma7", "medium", starts[0]), PushingHand::new("sigma7", upper_hand, starts[1])];
+        // The force of a renderer that begins grows within a second.
+        for tick in 0..3000_u32 {
+            let way_m = |tick: u32| 5e-5 * f64::from(tick.saturating_sub(1200).min(3000 - tick).min(360));
+            let target_m = |which: usize, tick: u32| match which {
+                0 => starts[0].place_m + way_m(tick) * DVec3::Z,
+                _ => starts[1].place_m - if is_held { way_m(tick) * DVec3::Z } else { 0.01 * DVec3::Z },
+            };
+            let seen = [hands[0].seen(0, f64::from(tick) * TICK_S), hands[1].seen(30, f64::from(tick) * TICK_S)];
+            for (which, hand) in hands.iter_mut().enumerate() {
+                hand.tick(tick, [target_m(which, tick), target_m(which, tick + 1)], seen[1 - which], is_second);
+            }
+        }
+        hands
+    }
+
+    #[test]
+    fn two_instruments_that_are_pushed_together_do_not_pass_and_give_no_energy() {
+        let along_y = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2);
+        let shaft = InstrumentPose::at(DVec3::new(0.03, 0.0, 0.0));
+        let crossed = InstrumentPose { orientation: along_y, ..InstrumentPose::at(DVec3::new(0.0, 0.03, 0.006)) };
+        // The second instrument points down, with its tip on the first one's shaft.
+        let down = DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2);
+        let tip = InstrumentPose { orientation: down, ..InstrumentPose::at(DVec3::new(0.0, 0.0, 0.006)) };
+        for (upper, is_second, is_held) in [crossed, tip]
+            .into_iter()
+            .flat_map(|upper| [(true, true), (false, true), (true, false)].map(|(a, b)| (upper, a, b)))
+        {
+            let hands = push([shaft, upper], is_second, is_held);
+            let together_j: f64 = hands.iter().map(|hand| hand.renderer.envelope.energy_j()).sum();
+            for PushingHand { deepest_m, least_j, most_n, .. } in hands {
+                assert!(deepest_m < 0.0055 && deepest_m > 1e-4 && most_n > 0.2, "{deepest_m} m {most_n} N");
+                // One of two hands may get what the other gives.
+                assert!(is_second || least_j > -3e-4, "{least_j} J");
+            }
+            assert!(together_j > -5e-4, "{together_j} J");
+        }
+    }
+
+    #[test]
+    fn a_device_without_torque_gives_its_second_hand_nothing_by_turning() {
+        for (device, gives) in [("omega3", false), ("sigma7", true)] {
+            let middle = InstrumentPose::at(DVec3::new(0.03, 0.0, 0.0));
+            let mut hand = PushingHand::new(device, "medium", middle);
+            let other = PushingHand::new(device, "medium", InstrumentPose::at(DVec3::new(-0.02, 0.0, 0.0061)));
+            for tick in 0..2000_u32 {
+                // Its end turns up into the other shaft.
+                let angle = 0.03 * (f64::from(tick) - 1200.0).max(0.0) / 800.0;
+                hand.pose = InstrumentPose { orientation: DQuat::from_rotation_y(angle), ..middle };
+                let now_s = f64::from(tick) * TICK_S;
+                let sample = WrenchSample {
+                    sequence: tick.into(),
+                    client_time_s: now_s,
+                    pose: hand.pose,
+                    wrench: Wrench::default(),
+                };
+                hand.renderer.receive(sample, now_s);
+                hand.renderer.follow_instruments(Some(other.seen(30, now_s)), &[]);
+                hand.renderer.tick(now_s, &hand.pose);
+            }
+            let (overlap_m, given_j) = (hand.renderer.overlap_m(), hand.renderer.given_j);
+            assert!(overlap_m > 5e-4, "{device}: {overlap_m} m");
+            assert!(if gives { given_j > 1e-5 } else { given_j == 0.0 }, "{device}: {given_j} J");
+        }
     }
 }

@@ -56,6 +56,7 @@
 //! assert!((force_n - 0.8 * DVec3::Z).length() < 1e-3, "{force_n}");
 //! ```
 
+pub mod capsule;
 pub mod datagram_health;
 pub mod dead_reckoning;
 pub mod deadband;
@@ -64,6 +65,7 @@ pub mod envelope;
 pub mod force_law;
 pub mod hand;
 pub mod instrument;
+pub mod instrument_contact;
 pub mod instrument_pose;
 pub mod instrument_renderer;
 pub mod local_model;
@@ -74,12 +76,14 @@ pub mod renderer;
 mod spatial_vector;
 pub mod tip;
 
+pub use capsule::{Capsule, MovingCapsule};
 pub use dead_reckoning::{MotionState, News, SendInterval};
 pub use deadband::ForceDeadband;
 pub use device::Device;
 pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use force_law::Law;
 pub use instrument::{Instrument, InstrumentPart, InstrumentTip};
+pub use instrument_contact::{ContactLoad, InstrumentContact, OtherInstrument, SecondHand};
 pub use instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
 pub use instrument_renderer::{InstrumentRenderer, WrenchSample};
 pub use local_model::{ContactState, LocalModel, Touching, Track};

@@ -5,9 +5,10 @@
 
 use std::collections::VecDeque;
 
-use glam::DVec3;
-use palpate_haptics::pose_playback::EXTRAPOLATE_S;
-use palpate_haptics::{Instrument, InstrumentPose, InstrumentVelocity, PortLoad, Wrench};
+use palpate_haptics::pose_playback::{EXTRAPOLATE_S, RELEASE_S};
+use palpate_haptics::{
+    ContactLoad, Instrument, InstrumentContact, InstrumentPose, InstrumentVelocity, OtherInstrument, PortLoad, Wrench,
+};
 
 use super::Sample;
 use super::command::Command;
@@ -29,16 +30,35 @@ struct AcceptedPose {
     is_far: bool,
 }
 
+/// Longest time from one sample to the next from which a velocity follows, s.
+const MAX_BETWEEN_S: f64 = 0.1;
+
 /// An instrument of a stream, with its newest poses.
 #[derive(Debug, Clone)]
 pub struct LedInstrument {
     instrument: Instrument,
     first_tool: u32,
     poses: VecDeque<AcceptedPose>,
+    contact: InstrumentContact,
+    /// Where it was at the newest sample, for others, and for the next velocity; `None` if it was nowhere.
+    seen: Option<(OtherInstrument, SeenPose)>,
+}
+
+/// Where an instrument was at a sample.
+#[derive(Debug, Clone, Copy)]
+struct SeenPose {
+    /// Simulated time of the sample, and that time by the client's clock, s; 0 if its poses have none.
+    now_s: f64,
+    client_time_s: f64,
+    pose: InstrumentPose,
+    /// The newest pose that has arrived, if the instrument is far from the tissue.
+    far: Option<u64>,
+    /// Simulated time since which that is the newest one, s.
+    since_s: f64,
 }
 
 /// What an instrument felt at the end of a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct InstrumentSample {
     /// The tool of its first tip.
     pub first_tool: u32,
@@ -52,12 +72,15 @@ pub struct InstrumentSample {
     pub opening_n_m: Option<f64>,
     /// What its port and the hand exert; `None` without a port.
     pub port_load: Option<PortLoad>,
+    /// The instruments that it overlaps with, by the tool of their first tip, and what they exert.
+    pub contacts: Vec<(u32, ContactLoad)>,
 }
 
 impl LedInstrument {
     /// Creates an instrument without a pose. Its tips are the tools from `first_tool` on.
     pub fn new(instrument: Instrument, first_tool: u32) -> Self {
-        LedInstrument { instrument, first_tool, poses: VecDeque::new() }
+        let contact = InstrumentContact::new(&instrument);
+        LedInstrument { instrument, first_tool, poses: VecDeque::new(), contact, seen: None }
     }
 
     /// Returns the instrument.
@@ -145,34 +168,87 @@ impl LedInstrument {
     /// Notes that the commands of [`LedInstrument::release`] were accepted.
     pub fn released(&mut self) {
         self.poses.clear();
+        self.contact.forget();
+        self.seen = None;
     }
 
-    /// Returns what the instrument felt by a sample of its tools; `None` before its first pose has acted, and after its release. One
-    /// that is far from the tissue feels nothing, where its newest pose has it.
-    pub fn sample(&self, sample: &Sample) -> Option<InstrumentSample> {
-        let tips = || sample.tools.iter().filter_map(|tool| Some((self.tip(tool.tool)?, tool)));
-        let Some((_, led)) = tips().find(|(_, tool)| tool.feel.is_some()) else {
-            let far = self.poses.back().filter(|newest| newest.is_far)?;
-            return Some(self.felt(far.client_time_s?, far.pose, &[]));
+    /// Finds where the instrument is by a sample of its tools, for the other instruments of its session ([`LedInstrument::seen`]).
+    pub fn see(&mut self, sample: &Sample) {
+        let before = self.seen.map(|(_, before)| before);
+        let Some((at, velocity)) = self.at(sample, before) else {
+            self.seen = None;
+            return;
         };
-        let pose = self.instrument.lead(&self.pose_at(led.acknowledged_sequence, led.place_time_s)?);
-        let forces_n: Vec<_> =
-            tips().filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n))).collect();
-        Some(self.felt(led.place_time_s, pose, &forces_n))
+        let rows = self.contact.rows();
+        let other = OtherInstrument::of(self.first_tool, &self.instrument, rows, &at.pose, &velocity, at.now_s);
+        self.seen = Some((other, at));
     }
 
-    /// Returns what the instrument feels at a pose by forces on its tips, N.
-    fn felt(&self, client_time_s: f64, pose: InstrumentPose, forces_n: &[(usize, DVec3)]) -> InstrumentSample {
+    /// Returns where the instrument was at the newest sample, by the simulated time; `None` if it was nowhere, or if that sample is of
+    /// more than 0.25 s before `now_s`.
+    pub fn seen(&self, now_s: f64) -> Option<OtherInstrument> {
+        self.seen.filter(|(_, at)| now_s - at.now_s <= RELEASE_S).map(|(seen, _)| seen)
+    }
+
+    /// Returns what the instrument felt by a sample of its tools that it has seen ([`LedInstrument::see`]); `None` before its first pose
+    /// has acted, and after its release. One that is far from the tissue feels only other instruments, where its newest pose has it.
+    /// `others` are those of the session.
+    pub fn sample(
+        &mut self,
+        sample: &Sample,
+        others: impl IntoIterator<Item = OtherInstrument>,
+    ) -> Option<InstrumentSample> {
+        let SeenPose { client_time_s, pose, .. } = self.seen?.1;
+        let tips = sample.tools.iter().filter_map(|tool| Some((self.tip(tool.tool)?, tool)));
+        let forces_n: Vec<_> =
+            tips.filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n))).collect();
         let forces_n = || forces_n.iter().copied();
-        let wrench = self.instrument.wrench(&pose, forces_n());
-        InstrumentSample {
-            first_tool: self.first_tool,
+        let LedInstrument { instrument, first_tool, contact, .. } = self;
+        contact.begin();
+        let others = others.into_iter().filter(|other| other.first_tool != *first_tool);
+        let touching = others.filter_map(|other| {
+            let capsules = other.capsules.iter().flatten().map(|capsule| capsule.at(sample.simulation_time_s));
+            Some((other.first_tool, contact.feel(instrument, &pose, other.first_tool, capsules)?))
+        });
+        let mut contacts: Vec<_> = touching.collect();
+        contacts.sort_by_key(|(tool, _)| *tool);
+        let wrench = instrument.wrench(&pose, forces_n());
+        Some(InstrumentSample {
+            first_tool: *first_tool,
             client_time_s,
             pose,
             wrench,
-            opening_n_m: self.instrument.has_jaws().then(|| self.instrument.opening_n_m(&pose, forces_n())),
-            port_load: self.instrument.port_load(&pose, &wrench),
+            opening_n_m: instrument.has_jaws().then(|| instrument.opening_n_m(&pose, forces_n())),
+            port_load: instrument.port_load(&pose, &wrench),
+            contacts,
+        })
+    }
+
+    /// Returns where the instrument is at a sample of its tools, and its velocity; `before`: at the sample before. One that is far from
+    /// the tissue is where the newest pose that has arrived has it, until its client has been silent for as long as tools are held.
+    fn at(&self, sample: &Sample, before: Option<SeenPose>) -> Option<(SeenPose, InstrumentVelocity)> {
+        let now_s = sample.simulation_time_s;
+        if let Some(led) = sample.tools.iter().find(|tool| tool.feel.is_some() && self.has(tool.tool)) {
+            let pose = self.instrument.lead(&self.pose_at(led.acknowledged_sequence, led.place_time_s)?);
+            let at = SeenPose { now_s, client_time_s: led.place_time_s, pose, far: None, since_s: now_s };
+            let before = before.filter(|before| before.far.is_none());
+            let velocity = before.and_then(|before| velocity(&before.pose, &pose, now_s - before.now_s));
+            return Some((at, velocity.unwrap_or_default()));
         }
+        let newest = self.poses.back().filter(|newest| newest.is_far)?;
+        let same = before.filter(|before| before.far == Some(newest.sequence));
+        let since_s = same.map_or(now_s, |before| before.since_s);
+        if newest.client_time_s.is_some() && now_s - since_s > RELEASE_S {
+            return None;
+        }
+        // By the client's clock: poses may arrive together.
+        let earlier =
+            self.poses.iter().rev().nth(1).and_then(|earlier| {
+                velocity(&earlier.pose, &newest.pose, newest.client_time_s? - earlier.client_time_s?)
+            });
+        let client_time_s = newest.client_time_s.unwrap_or(0.0);
+        let at = SeenPose { now_s, client_time_s, pose: newest.pose, far: Some(newest.sequence), since_s };
+        Some((at, earlier.unwrap_or(newest.velocity)))
     }
 
     /// Returns the pose of the command with a sequence number, or, for poses that are played by the client's time, that at a time
@@ -194,4 +270,13 @@ impl LedInstrument {
             _ => before.velocity.after(&before.pose, passed_s.clamp(0.0, EXTRAPOLATE_S)),
         })
     }
+}
+
+/// Returns the velocity between two poses that are `between_s` (s) apart; `None` if that is no time, or too long.
+fn velocity(from: &InstrumentPose, to: &InstrumentPose, between_s: f64) -> Option<InstrumentVelocity> {
+    (between_s > 0.0 && between_s < MAX_BETWEEN_S).then(|| InstrumentVelocity {
+        velocity_m_per_s: (to.place_m - from.place_m) / between_s,
+        angular_rad_per_s: from.turn_to(to) / between_s,
+        jaw_rad_per_s: (to.jaw_rad - from.jaw_rad) / between_s,
+    })
 }

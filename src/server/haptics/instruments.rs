@@ -1,16 +1,10 @@
-//! The instruments of a haptic stream.
+//! Reads the instruments that a haptic stream declares.
 
-use std::sync::{Arc, Mutex};
-
-use palpate_haptics::PortLoad;
 use palpate_proto::{instrument, pb};
 use palpate_refusal::{Reason, Refusal, Result};
-use palpate_session::led_instrument::{InstrumentSample, LedInstrument};
+use palpate_session::led_instrument::LedInstrument;
 use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::shape::RestShape;
-
-/// The instruments of a stream, which its commands move and its samples tell of.
-pub(super) type Instruments = Arc<Mutex<Vec<LedInstrument>>>;
 
 /// Reads the instruments that a stream declares.
 ///
@@ -41,24 +35,4 @@ pub(super) fn instruments(open: &pb::TouchOpen, shape: &dyn RestShape) -> Result
         read.push(LedInstrument::new(instrument, message.first_tool));
     }
     Ok(read)
-}
-
-/// Converts what an instrument felt to a message.
-pub(super) fn message(sample: &InstrumentSample) -> pb::InstrumentSample {
-    use palpate_proto::geometry::vector;
-    pb::InstrumentSample {
-        first_tool: sample.first_tool,
-        about_m: vector(sample.pose.place_m),
-        force_on_tool_n: vector(sample.wrench.force_n),
-        torque_on_tool_n_m: vector(sample.wrench.torque_n_m),
-        opening_n_m: sample.opening_n_m,
-        orientation: instrument::orientation(sample.pose.orientation),
-        jaw_rad: sample.pose.jaw_rad,
-        client_time_ns: (sample.client_time_s * 1e9).round().max(0.0) as u64,
-        port_load: sample.port_load.map(|PortLoad { force_of_port_n, on_hand }| pb::PortLoad {
-            force_of_port_n: vector(force_of_port_n),
-            force_on_hand_n: vector(on_hand.force_n),
-            torque_on_hand_n_m: vector(on_hand.torque_n_m),
-        }),
-    }
 }

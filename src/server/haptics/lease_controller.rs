@@ -9,8 +9,8 @@ use palpate_proto::{datagram, instrument, pb};
 use tracing::{debug, info};
 
 use super::event::StreamEvent;
-use super::instruments::Instruments;
 use crate::server::rate::Bucket;
+use crate::server::session_instruments::Instruments;
 use crate::server::traffic::Traffic;
 use palpate_realtime::SessionHandle;
 use palpate_realtime::clock::now_ns;

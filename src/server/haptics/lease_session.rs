@@ -8,7 +8,6 @@ use prost::Message;
 use tracing::{Instrument, debug, info};
 
 use super::event::StreamEvent;
-use super::instruments::Instruments;
 use super::lease_controller::LeaseController;
 use super::response_stream::ResponseStream;
 use super::stream::KeepaliveTimer;
@@ -16,6 +15,7 @@ use super::tools::lease_id;
 use crate::server::datagrams::{Arrival, DatagramChannel, GOOD, not_available};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
+use crate::server::session_instruments::Instruments;
 use palpate_realtime::StreamKind;
 use palpate_realtime::queue::{Writer, queue};
 use palpate_refusal::{Refusal, Result};
@@ -58,6 +58,7 @@ pub(super) async fn offer(
     let cut = guard.cut().clone();
     let samples = handle.samples(sampling, Some(account));
     let notices = Notices::new(tools, step);
+    let instruments = services.instruments.join(&request.session_id, instruments, false);
     let responses = ResponseStream::new(None, heard, samples, notices, guard, channel.clone(), instruments);
     let session = LeaseSession { controller, responses, channel, arrival: Some(arrival), events };
     let serving = async move {

@@ -8,18 +8,16 @@ use palpate_proto::pb;
 use tonic::Status;
 
 use super::event::StreamEvent;
-use super::instruments::{Instruments, message};
 use crate::server::datagrams::DatagramChannel;
 use crate::server::force_law::Updates;
 use crate::server::recovered::Notices;
+use crate::server::session_instruments::JoinedInstruments;
 use palpate_realtime::StreamGuard;
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::queue::Reader;
 use palpate_refusal::Reason;
-use palpate_session::led_instrument::LedInstrument;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
-use palpate_tissue::lock::lock;
 
 /// Longest interval between samples on the stream while they go by datagram, ns.
 const HEARTBEAT_NS: u64 = 1_000_000_000;
@@ -31,7 +29,7 @@ pub(super) struct ResponseStream {
     samples: Reader<PacedSample>,
     notices: Notices,
     channel: Arc<DatagramChannel>,
-    instruments: Instruments,
+    instruments: JoinedInstruments,
     /// When the last sample was sent on the stream, ns.
     streamed_ns: u64,
     /// The messages before the next sample, and that sample.
@@ -49,7 +47,7 @@ impl ResponseStream {
         notices: Notices,
         guard: StreamGuard,
         channel: Arc<DatagramChannel>,
-        instruments: Instruments,
+        instruments: JoinedInstruments,
     ) -> Self {
         ResponseStream {
             updates,
@@ -113,8 +111,7 @@ impl ResponseStream {
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
             let mut sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
-            let felt = |instrument: &LedInstrument| Some(message(&instrument.sample(&paced.sample)?));
-            sample.instruments = lock(&self.instruments).iter().filter_map(felt).collect();
+            self.instruments.add_to(&mut sample, &paced.sample);
             // The stream has a heartbeat of its own, which shows a client that it still works.
             let (now, by_datagram) = (now_ns(), self.channel.send(&sample));
             if !by_datagram || now.saturating_sub(self.streamed_ns) >= HEARTBEAT_NS {

@@ -16,7 +16,7 @@ use tonic::{Status, Streaming};
 use tracing::{Instrument, debug, info};
 
 use super::event::StreamEvent;
-use super::instruments::{Instruments, instruments};
+use super::instruments::instruments;
 use super::lease_controller::LeaseController;
 use super::pending_messages::PendingMessages;
 use super::response_stream::ResponseStream;
@@ -25,6 +25,7 @@ use crate::server::datagrams::{Arrival, DatagramChannel};
 use crate::server::force_law::{Computing, Updates};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
+use crate::server::session_instruments::{Instruments, JoinedInstruments};
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::ids::random_bits;
 use palpate_realtime::queue::{Reader, Writer, queue};
@@ -46,7 +47,7 @@ struct Opened {
     notices: Notices,
     guard: StreamGuard,
     channel: Arc<DatagramChannel>,
-    instruments: Instruments,
+    instruments: JoinedInstruments,
 }
 
 /// The tools of a stream, released when it ends for any reason.
@@ -201,6 +202,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let samples = handle.samples(sampling, open.tools.is_empty().then_some(account));
     info!(session = %handle.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
     let notices = Notices::new(open.tools.clone(), step);
+    let instruments = services.instruments.join(&open.session_id, instruments, open.other_tools);
     Ok((Opened { answer, updates, samples, notices, guard, channel, instruments }, held))
 }
 
@@ -337,7 +339,7 @@ pub(super) struct Output {
 /// The stages of a stream: first the answer to `open`, then samples and rejections.
 enum StreamStage {
     Opening(oneshot::Receiver<Result<Opened, Status>>, Option<Reader<StreamEvent>>),
-    Open(ResponseStream),
+    Open(Box<ResponseStream>),
     Over,
 }
 
@@ -352,7 +354,7 @@ impl Stream for Output {
                 (Ok(Ok(opened)), Some(events)) => {
                     let Opened { answer, updates, samples, notices, guard, channel, instruments } = opened;
                     let responses = ResponseStream::new(updates, events, samples, notices, guard, channel, instruments);
-                    *stage = StreamStage::Open(responses);
+                    *stage = StreamStage::Open(Box::new(responses));
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),

@@ -174,7 +174,7 @@ async fn an_instrument_in_a_port_stays_in_it() {
     let mut pressed_n = 0.0_f64;
     while pressed_n < 0.05 {
         let sample = touch.sample_with(|sample| !sample.instruments.is_empty()).await;
-        let felt = sample.instruments[0];
+        let felt = sample.instruments[0].clone();
         let about_m = from_vector(felt.about_m.as_ref());
         let turn = felt.orientation.unwrap();
         let axis = DQuat::from_xyzw(turn.x, turn.y, turn.z, turn.w) * DVec3::X;
@@ -196,7 +196,7 @@ async fn an_instrument_that_is_far_away_feels_nothing_and_its_client_is_told_of_
     let told = pb::Command { client_time_ns: 7_000_000, at_step: None, ..command(0, instrument::pose(&far)) };
     touch.command(told).await;
     let sample = touch.sample_with(|sample| !sample.instruments.is_empty()).await;
-    let felt = sample.instruments[0];
+    let felt = sample.instruments[0].clone();
     assert_eq!((felt.client_time_ns, from_vector(felt.about_m.as_ref())), (7_000_000, far.place_m));
     assert_eq!(from_vector(felt.force_on_tool_n.as_ref()), DVec3::ZERO);
     let change =
@@ -306,4 +306,64 @@ fn an_instrument_is_read_as_it_was_written() {
     let there = InstrumentPose { place_m: DVec3::new(0.04, 0.04, 0.2005), ..pose };
     let refusal = instrument::from_pose(&instrument::pose(&there), &grasper).unwrap_err();
     assert!(refusal.to_string().contains("from 0.001 to 0.299 m from the port"), "{refusal}");
+}
+
+/// Two clients' shafts lie across each other, 5 mm apart with radii of 3 mm: each is told of the other.
+#[tokio::test]
+async fn instruments_of_two_streams_push_each_other_apart() {
+    let server = TestServer::start(&[]);
+    let session = liver(&server, true).await;
+    let tip = Tip { radius_m: 0.003, ..Tip::default() };
+    let mut shaft = Instrument::default();
+    shaft.add_row(DVec3::ZERO, -0.03 * DVec3::X, tip, InstrumentPart::Body);
+    let tips = u32::try_from(shaft.tips.len()).unwrap();
+    let opened = async |first: u32| {
+        let instruments = vec![instrument::instrument(&shaft, first)];
+        let tools: Vec<u32> = (first..first + tips).collect();
+        let request = pb::TouchOpen { instruments, other_tools: true, ..open(&session, &tools) };
+        TestTouch::open(&server, request).await.unwrap()
+    };
+    let (mut lower, mut upper) = (opened(0).await, opened(20).await);
+    let along = InstrumentPose::at(DVec3::new(0.05, 0.0375, 0.008));
+    let across = InstrumentPose {
+        orientation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
+        ..InstrumentPose::at(DVec3::new(0.0375, 0.05, 0.013))
+    };
+    for (stream, tool, pose) in [(&mut lower, 0, along), (&mut upper, 20, across)] {
+        stream.command(pb::Command { tool, ..command(0, instrument::pose(&pose)) }).await;
+        stream.settle().await;
+    }
+    // Each stream has seen its own instrument before the other one's next sample.
+    start(&server, &session, 20).await;
+    lower.sample_with(|sample| sample.step == 20).await;
+    upper.sample_with(|sample| sample.step == 20).await;
+    start(&server, &session, 21).await;
+    for (stream, pose, other, sign) in [(&mut lower, along, 20, -1.0), (&mut upper, across, 0, 1.0)] {
+        let sample = stream.sample_with(|sample| sample.step == 21).await;
+        let [felt] = &sample.instruments[..] else { panic!("{sample:?}") };
+        let [contact] = &felt.contacts[..] else { panic!("{felt:?}") };
+        assert_eq!(contact.other_tool, other);
+        // 1 mm of 6: 1000 N/m · 1 mm / (1 − 1/6).
+        let force_n = from_vector(contact.force_n.as_ref());
+        assert!((contact.depth_m - 0.001).abs() < 1e-9, "{contact:?}");
+        assert!(force_n.distance(sign * 1.2 * DVec3::Z) < 1e-6, "{contact:?}");
+        let middle_m = DVec3::new(0.0375, 0.0375, 0.0105);
+        let torque_n_m = (middle_m - pose.place_m).cross(force_n);
+        assert!(from_vector(contact.torque_n_m.as_ref()).distance(torque_n_m) < 1e-6, "{contact:?}");
+        // The tissue is not touched.
+        assert_eq!(from_vector(felt.force_on_tool_n.as_ref()), DVec3::ZERO);
+        let [seen] = &sample.other_instruments[..] else { panic!("{sample:?}") };
+        assert_eq!((seen.first_tool, seen.capsules.len(), seen.capsules[0].radius_m), (other, 1, 0.003));
+    }
+    // Who has gone touches nothing.
+    drop(upper);
+    let mut sample = pb::Sample::default();
+    for step in 22..2000 {
+        start(&server, &session, step).await;
+        sample = lower.sample_with(|sample| sample.step >= step).await;
+        if sample.instruments[0].contacts.is_empty() {
+            break;
+        }
+    }
+    assert!(sample.instruments[0].contacts.is_empty() && sample.other_instruments.is_empty(), "{sample:?}");
 }

@@ -1,8 +1,8 @@
 //! What a loop renders with: the rendering law of a single tip, or that of an instrument.
 
 use palpate_haptics::{
-    Envelope, InstrumentPose, InstrumentRenderer, Law, LocalModel, OtherTool, Prediction, Renderer, RenderingState,
-    Wrench, WrenchSample,
+    Envelope, InstrumentPose, InstrumentRenderer, Law, LocalModel, OtherInstrument, OtherTool, Prediction, Renderer,
+    RenderingState, SecondHand, Wrench, WrenchSample,
 };
 
 /// The renderer of a loop.
@@ -56,6 +56,21 @@ impl LoopRenderer {
         match self {
             LoopRenderer::Tip(renderer) => renderer.follow_others(others),
             LoopRenderer::Instrument(renderer) => renderer.follow_others(others),
+        }
+    }
+
+    /// Replaces what is known of other instruments, as [`InstrumentRenderer::follow_instruments`] does; a single tip touches none.
+    pub(super) fn follow_instruments(&mut self, second: Option<SecondHand>, others: &[OtherInstrument]) {
+        if let LoopRenderer::Instrument(renderer) = self {
+            renderer.follow_instruments(second, others);
+        }
+    }
+
+    /// Returns this hand with its instrument at a pose, as its other hand follows it.
+    pub(super) fn as_second_hand(&self, first_tool: u32, led: &InstrumentPose, now_s: f64) -> Option<SecondHand> {
+        match self {
+            LoopRenderer::Tip(_) => None,
+            LoopRenderer::Instrument(renderer) => Some(renderer.as_second_hand(first_tool, led, now_s)),
         }
     }
 

@@ -7,11 +7,12 @@
 use glam::{DQuat, DVec3};
 use palpate_haptics::dead_reckoning::News;
 use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::instrument_contact::MAX_OTHER_INSTRUMENTS;
 use palpate_haptics::prediction::{MAX_OTHERS, midway_s};
 use palpate_haptics::renderer::MAX_LAWS;
 use palpate_haptics::{
-    Device, Envelope, Instrument, InstrumentPose, InstrumentRenderer, Law, MotionState, OtherTool, Prediction,
-    Predictor, Renderer, RenderingState, Tip, Wrench,
+    Device, Envelope, Instrument, InstrumentPose, InstrumentRenderer, Law, MotionState, OtherInstrument, OtherTool,
+    Prediction, Predictor, Renderer, RenderingState, SecondHand, Tip, Wrench,
 };
 use palpate_proto::{instrument, pb, touch};
 use std::collections::VecDeque;
@@ -57,6 +58,8 @@ struct Newest {
     sample: Option<NewestSample>,
     /// The other tools at the time of the sample, and their number.
     others: [Option<OtherTool>; MAX_OTHERS],
+    /// The instruments of other clients then.
+    instruments: [Option<OtherInstrument>; MAX_OTHER_INSTRUMENTS],
     /// The longest time between two poses that the server wants, s; 0 before it has sent one.
     wanted_s: f64,
 }
@@ -110,8 +113,9 @@ pub struct Ticker {
     /// The time by the client's clock at which the other tools of the newest model were where it says, s; `None` before the
     /// first model.
     others_time_s: Option<f64>,
-    /// The other tools; kept so that a tick allocates nothing.
+    /// The other tools, and the instruments of other clients; kept so that a tick allocates nothing.
     others: Vec<OtherTool>,
+    other_instruments: Vec<OtherInstrument>,
 }
 
 /// The network's half of a bridge: passes laws, models and copies to the ticks.
@@ -124,6 +128,7 @@ pub(super) struct LoopFeed {
     waiting: VecDeque<LoopEvent>,
     sample: Option<NewestSample>,
     others: [Option<OtherTool>; MAX_OTHERS],
+    instruments: [Option<OtherInstrument>; MAX_OTHER_INSTRUMENTS],
     wanted_s: f64,
 }
 
@@ -136,8 +141,13 @@ pub(super) fn ticker(
     let (to_learn, told) = queue(LAWS);
     let (used, back) = queue(USED);
     let (commands, received) = queue(COMMANDS);
-    let (newest_writer, newest_reader) =
-        newest(&Newest { connection: 0, sample: None, others: [None; MAX_OTHERS], wanted_s: 0.0 });
+    let (newest_writer, newest_reader) = newest(&Newest {
+        connection: 0,
+        sample: None,
+        others: [None; MAX_OTHERS],
+        instruments: [None; MAX_OTHER_INSTRUMENTS],
+        wanted_s: 0.0,
+    });
     let ticker = Ticker {
         told,
         newest: newest_reader,
@@ -160,6 +170,7 @@ pub(super) fn ticker(
         hand: None,
         others_time_s: None,
         others: Vec::with_capacity(2 * MAX_OTHERS),
+        other_instruments: Vec::with_capacity(MAX_OTHER_INSTRUMENTS),
     };
     let feed = LoopFeed {
         told: to_learn,
@@ -169,6 +180,7 @@ pub(super) fn ticker(
         waiting: VecDeque::new(),
         sample: None,
         others: [None; MAX_OTHERS],
+        instruments: [None; MAX_OTHER_INSTRUMENTS],
         wanted_s: 0.0,
     };
     (ticker, feed, received)
@@ -214,7 +226,7 @@ impl Ticker {
     #[must_use]
     pub(super) fn of_instrument(self, instrument: Option<Instrument>) -> Self {
         let Some(instrument) = instrument else { return self };
-        let renderer = InstrumentRenderer::new(Envelope::new(self.device, DVec3::ZERO), instrument.port);
+        let renderer = InstrumentRenderer::new(Envelope::new(self.device, DVec3::ZERO), instrument.clone());
         Ticker { renderer: LoopRenderer::Instrument(Box::new(renderer)), instrument: Some(instrument), ..self }
     }
 
@@ -258,7 +270,7 @@ impl Ticker {
             renderer.envelope_mut().reset();
             renderer.envelope_mut().enable();
         }
-        let Newest { connection, sample, others, wanted_s } = self.newest.read();
+        let Newest { connection, sample, others, instruments, wanted_s } = self.newest.read();
         let (connection, wanted_s) = (*connection, *wanted_s);
         let is_news = self.is_fresh && connection == self.connection;
         if let Some(time_s) = sample.filter(|_| is_news).and_then(|sample| renderer.receive(&sample, now_s)) {
@@ -266,6 +278,7 @@ impl Ticker {
         }
         self.is_fresh &= !is_news;
         let of_time = |other: OtherTool, time_s| OtherTool { motion: MotionState { time_s, ..other.motion }, ..other };
+        let mut second = None;
         if is_news || self.hand.is_some() {
             self.others.clear();
             if let Some((hand, first, tip)) = &mut self.hand {
@@ -277,11 +290,15 @@ impl Ticker {
                     Some(instrument) => {
                         let led = instrument.lead(&pose);
                         let tips = instrument.tips.iter().zip(*first..).enumerate();
-                        hand.tell(tips.map(|(number, (of, tool))| at(tool, of.tip, instrument.tip_m(number, &led))));
+                        let tips = tips.map(|(number, (of, tool))| at(tool, of.tip, instrument.tip_m(number, &led)));
+                        hand.tell(tips, renderer.as_second_hand(*first, &led, now_s));
                     }
-                    None => hand.tell(std::iter::once(at(*first, *tip, place_m))),
+                    None => hand.tell(std::iter::once(at(*first, *tip, place_m)), None),
                 }
-                self.others.extend(hand.other().map(|other| of_time(other, now_s)));
+                let (other, tools) = hand.other();
+                // The clock of the other loop began at another moment.
+                second = other.map(|other| SecondHand { instrument: other.instrument.at_time(now_s), ..other });
+                self.others.extend(tools.map(|other| of_time(other, now_s)));
             }
             let own = self.others.len();
             if let Some(time_s) = self.others_time_s.filter(|_| connection == self.connection) {
@@ -293,6 +310,15 @@ impl Ticker {
                 }
             }
             renderer.follow_others(&self.others);
+            self.other_instruments.clear();
+            if let Some(time_s) = self.others_time_s.filter(|_| connection == self.connection) {
+                let is_second = |other: &OtherInstrument| {
+                    second.is_some_and(|second: SecondHand| second.instrument.first_tool == other.first_tool)
+                };
+                let known = instruments.iter().map_while(|other| *other).filter(|other| !is_second(other));
+                self.other_instruments.extend(known.map(|other| other.at_time(time_s)));
+            }
+            renderer.follow_instruments(second, &self.other_instruments);
         }
         let wrench = renderer.tick(now_s, &pose);
         if !(pose.is_finite() && now_s.is_finite()) {
@@ -423,6 +449,7 @@ impl LoopFeed {
         let law = message.map_or(Ok(Law::linear(0.0, 0.0)), law)?;
         self.connection += 1;
         (self.sample, self.wanted_s) = (None, 0.0);
+        (self.others, self.instruments) = ([None; MAX_OTHERS], [None; MAX_OTHER_INSTRUMENTS]);
         // Drops what the ticks have not taken of the connection before.
         self.waiting.clear();
         self.waiting.push_back(LoopEvent::Begin { connection: self.connection, law, origin_m });
@@ -462,6 +489,10 @@ impl LoopFeed {
         let wrench = sample.instruments.first().map(|felt| instrument::from_sample(felt, sample.step));
         let told = wrench.map(|wrench| (NewestSample::Wrench(wrench), wrench.client_time_s));
         let told = told.or_else(|| model.map(|model| (NewestSample::Model(model), model.client_time_s)));
+        if told.is_none() {
+            // When the others were where is not known.
+            (self.others, self.instruments) = ([None; MAX_OTHERS], [None; MAX_OTHER_INSTRUMENTS]);
+        }
         if let Some((told, time_s)) = told
             && self.sample.is_none_or(|newest| newest.sequence() < told.sequence())
         {
@@ -469,6 +500,9 @@ impl LoopFeed {
             let others = sample.other_tools.iter().map(|other| touch::from_other_tool(other, time_s));
             self.others = [None; MAX_OTHERS];
             self.others.iter_mut().zip(others.flatten()).for_each(|(place, other)| *place = Some(other));
+            let others = sample.other_instruments.iter().map(|other| instrument::from_other_instrument(other, time_s));
+            self.instruments = [None; MAX_OTHER_INSTRUMENTS];
+            self.instruments.iter_mut().zip(others).for_each(|(place, other)| *place = Some(other));
         }
         self.pass_on();
     }
@@ -482,8 +516,8 @@ impl LoopFeed {
                 return;
             }
         }
-        let Self { connection, sample, others, wanted_s, .. } = *self;
-        let newest = Newest { connection, sample, others, wanted_s };
+        let Self { connection, sample, others, instruments, wanted_s, .. } = *self;
+        let newest = Newest { connection, sample, others, instruments, wanted_s };
         self.newest.write(|place| *place = newest);
     }
 }

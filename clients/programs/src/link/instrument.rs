@@ -54,8 +54,8 @@ const UNSTABLE_AMPLITUDES: f64 = 3.0;
 const UNSTABLE_J: f64 = -0.1;
 
 /// Bytes of a message with a pose, and of one with a sample.
-const POSE_BYTES: u64 = 66 + 130;
-const SAMPLE_BYTES: u64 = 66 + 220;
+pub(super) const POSE_BYTES: u64 = 66 + 130;
+pub(super) const SAMPLE_BYTES: u64 = 66 + 220;
 
 impl InstrumentKind {
     fn instrument(self, tip: Tip) -> Instrument {
@@ -103,7 +103,7 @@ impl Turning {
 }
 
 /// A hand that holds a device of six axes.
-struct TurningHand {
+pub(super) struct TurningHand {
     hand: Hand,
     moved: HandState,
     /// The turn from the orientation at rest, rad.
@@ -111,20 +111,20 @@ struct TurningHand {
 }
 
 impl TurningHand {
-    fn new(hand: Hand, start_m: DVec3) -> Self {
+    pub(super) fn new(hand: Hand, start_m: DVec3) -> Self {
         let moved = HandState { place_m: start_m, velocity_m_per_s: DVec3::ZERO };
         TurningHand { hand, moved, turned: HandState::default() }
     }
 
-    /// Returns where the instrument is, in the hand's frame.
-    fn pose(&self, kind: InstrumentKind, jaw_rad: f64) -> InstrumentPose {
+    /// Returns where an instrument is whose hand has an `orientation` at rest, in the hand's frame.
+    pub(super) fn pose(&self, orientation: DQuat, jaw_rad: f64) -> InstrumentPose {
         let turn = InstrumentVelocity { angular_rad_per_s: self.turned.place_m, ..InstrumentVelocity::default() };
-        let rest = InstrumentPose { orientation: kind.orientation(), ..InstrumentPose::at(self.moved.place_m) };
+        let rest = InstrumentPose { orientation, ..InstrumentPose::at(self.moved.place_m) };
         InstrumentPose { jaw_rad, ..turn.after(&rest, 1.0) }
     }
 
     /// Goes on for a tick under a wrench, towards targets.
-    fn advance(&mut self, wrench: &Wrench, [from_m, to_m]: [DVec3; 2], [from_rad, to_rad]: [DVec3; 2]) {
+    pub(super) fn advance(&mut self, wrench: &Wrench, [from_m, to_m]: [DVec3; 2], [from_rad, to_rad]: [DVec3; 2]) {
         let string_n = self.hand.string_n(from_m, self.moved.place_m);
         self.moved = self.hand.advance(self.moved, from_m, to_m, wrench.force_n + string_n, TICK_S);
         // At the radius of gyration a turn is a way, and a torque a force: both divided by it once more, the equation is the same.
@@ -172,7 +172,9 @@ impl LedTissue {
                 return Err(reason);
             }
         }
-        let felt = self.led.sample(&self.simulation.session.sample(None));
+        let sample = self.simulation.session.sample(None);
+        self.led.see(&sample);
+        let felt = self.led.sample(&sample, []);
         Ok(felt.map(|felt| WrenchSample {
             sequence: self.simulation.session.step_count(),
             client_time_s: felt.client_time_s,
@@ -226,7 +228,7 @@ impl WrenchErrors {
 }
 
 /// Returns a pose of the hand's frame in the tissue's frame.
-fn in_tissue(spot: &Spot, pose: &InstrumentPose) -> InstrumentPose {
+pub(super) fn in_tissue(spot: &Spot, pose: &InstrumentPose) -> InstrumentPose {
     let [x, y, z] = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| spot.direction_of_tissue(axis));
     let turn = DQuat::from_mat3(&glam::DMat3::from_cols(x, y, z));
     InstrumentPose {
@@ -237,7 +239,7 @@ fn in_tissue(spot: &Spot, pose: &InstrumentPose) -> InstrumentPose {
 }
 
 /// Returns a wrench of the tissue's frame in the hand's frame.
-fn of_hand(spot: &Spot, wrench: &Wrench) -> Wrench {
+pub(super) fn of_hand(spot: &Spot, wrench: &Wrench) -> Wrench {
     Wrench { force_n: spot.direction(wrench.force_n), torque_n_m: spot.direction(wrench.torque_n_m) }
 }
 
@@ -252,7 +254,7 @@ fn scale(setup: &Setup, kind: InstrumentKind, instrument: &Instrument) -> Result
         let mut most = 0.0_f64;
         for tick in 0..ticks(setup.duration_s) {
             let now_s = f64::from(tick) * TICK_S;
-            let pose = in_tissue(&setup.spot, &hand.pose(kind, course.turning.jaw_rad(now_s)));
+            let pose = in_tissue(&setup.spot, &hand.pose(kind.orientation(), course.turning.jaw_rad(now_s)));
             tissue.lead(u64::from(tick) + 1, &pose, 0, now_s)?;
             let felt = tissue.step(now_s)?.map_or(Wrench::default(), |felt| of_hand(&setup.spot, &felt.wrench));
             most = most.max(felt.force_n.length());
@@ -310,7 +312,7 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
     server.by_datagram = setup.conditions.transport == Transport::Datagram;
     let mut envelope = Envelope::new(setup.device, setup.spot.of_tissue(setup.spot.at_m));
     envelope.enable();
-    let mut renderer = InstrumentRenderer::new(envelope, None);
+    let mut renderer = InstrumentRenderer::new(envelope, instrument.clone());
     let copy = TissueCopy::of_instrument(&setup.model, instrument.clone());
     renderer.predict(Some(Prediction::new(Box::new(copy))));
     let mut hand = TurningHand::new(setup.hand, course.task.start_m());
@@ -327,7 +329,7 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
             outcome.unstable_at_s = Some(now_s);
             break;
         }
-        let pose = in_tissue(&setup.spot, &hand.pose(kind, course.turning.jaw_rad(now_s)));
+        let pose = in_tissue(&setup.spot, &hand.pose(kind.orientation(), course.turning.jaw_rad(now_s)));
         let number = u64::from(tick) + 1;
         up.send(now_s, POSE_BYTES, (number, pose, now_s));
         while let Some((number, pose, sent_s)) = up.receive(now_s) {

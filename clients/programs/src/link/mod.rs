@@ -2,6 +2,7 @@
 //! the result. Only this program drives a tissue itself.
 
 mod boundary;
+mod clash;
 mod client;
 mod direct;
 mod figures;
@@ -38,11 +39,12 @@ use crate::ClientFailure;
 use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
 use crate::table;
+use clash::Clash;
 use figures::{figures, rows};
 use instrument::InstrumentKind;
 use laws::PlaceLaws;
 use run::run;
-use setup::{Rendering, SecondHand, Setup, TissueChange};
+use setup::{Rendering, SecondLeader, Setup, TissueChange};
 use spot::Spot;
 
 /// Arguments of `link`.
@@ -61,6 +63,10 @@ pub(crate) struct LinkArguments {
     /// The hand leads an instrument by a device of six axes, which renders force and torque from a copy of the tissue
     #[arg(long, value_name = "KIND", conflicts_with_all = ["second_tool_mm", "tissue_change_s", "stall_ms", "scheme", "deadband", "up_deadband", "course", "server", "boundary"])]
     instrument: Option<InstrumentKind>,
+    /// Two hands push shafts of 60 mm together above the tissue, at 0.1 m/s, and back, every two seconds. --second-hand own: both are
+    /// hands of this client
+    #[arg(long, value_name = "HOW", group = "second", conflicts_with_all = ["instrument", "second_tool_mm", "tissue_change_s", "stall_ms", "scheme", "deadband", "up_deadband", "course", "server", "boundary", "random"])]
+    clash: Option<Clash>,
     /// Round-trip time, ms
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     rtt_ms: Option<f64>,
@@ -87,11 +93,11 @@ pub(crate) struct LinkArguments {
     #[arg(long, value_name = "MS", default_value_t = 100.0, requires = "bandwidth_kbit")]
     queue_ms: f64,
     /// A second tool with its own seed presses at this distance from the place of the task, mm
-    #[arg(long, value_name = "MM", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
+    #[arg(long, value_name = "MM", default_value_t = 0.0, group = "second", conflicts_with_all = ["random", "boundary"])]
     second_tool_mm: f64,
-    /// With --second-tool-mm: who leads the second tool
-    #[arg(long, value_name = "WHOSE", default_value = "another", requires = "second_tool_mm")]
-    second_hand: SecondHand,
+    /// With --second-tool-mm or --clash: who leads the second tool or instrument
+    #[arg(long, value_name = "WHOSE", default_value = "another", requires = "second")]
+    second_hand: SecondLeader,
     /// The tissue changes at this time, s
     #[arg(long, value_name = "SECONDS", conflicts_with_all = ["random", "boundary"])]
     tissue_change_s: Option<f64>,
@@ -195,6 +201,9 @@ pub(crate) async fn link(arguments: &LinkArguments) -> Result<(), ClientFailure>
         return random::print(arguments, runs);
     }
     let setup = memory::attempt("--scene", || setup(arguments))?;
+    if let Some(clash) = arguments.clash {
+        return clash::print(arguments, &setup, clash);
+    }
     if let Some(kind) = arguments.instrument {
         return instrument_runs::print(arguments, &setup, kind);
     }
@@ -228,7 +237,7 @@ fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, ClientF
 fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let limits = Limits::default();
     let hand = hand_named(&arguments.hand)?;
-    let usual = if arguments.instrument.is_some() { "sigma7" } else { "omega3" };
+    let usual = if arguments.instrument.is_some() || arguments.clash.is_some() { "sigma7" } else { "omega3" };
     let device = device_named(arguments.device.as_deref().unwrap_or(usual))?;
     let conditions = match arguments.profile {
         Some(profile) => profile.conditions(),

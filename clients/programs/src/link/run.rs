@@ -15,7 +15,7 @@ use super::direct::Direct;
 use super::measure::{LinkOutcome, LinkTick, Totals};
 use super::poses::{Down, Poses, Up};
 use super::server::{LinkServer, Other, Told};
-use super::setup::{SecondHand, Setup, TICK_S, ticks};
+use super::setup::{SecondLeader, Setup, TICK_S, ticks};
 use super::tissue::{LinkTissue, Second};
 
 /// Distance of the tool, in amplitudes of the task, beyond which a run is also unstable.
@@ -61,7 +61,7 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
     let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
     let mut totals = Totals::with(Outages::new(conditions, *seed, task::LEAD_S));
     totals.outcome.scale = direct.scale;
-    let own = Second::of(setup).filter(|_| setup.second_hand == SecondHand::Own);
+    let own = Second::of(setup).filter(|_| setup.second_hand == SecondLeader::Own);
     let mut paused_s: Option<f64> = None;
     let mut stalls = Stalls::new(setup.stall_s, task::LEAD_S, Random::new(*seed, 4));
     let (mut force_n, mut bytes) = (DVec3::ZERO, 0);

@@ -16,7 +16,7 @@ use palpate_tissue::scene::script::Action;
 
 use super::laws::PlaceLaws;
 use super::poses::Up;
-use super::setup::{SecondHand, Setup, TICK_S};
+use super::setup::{SecondLeader, Setup, TICK_S};
 use super::spot::Spot;
 use super::tissue::{LEASE, LinkTissue, SECOND_LEASE, SECOND_TOOL, TOOL, ns};
 
@@ -69,8 +69,8 @@ impl LinkServer {
     /// Returns why the intake refuses the tools.
     pub(super) fn new(setup: &Setup) -> Result<Self, String> {
         let mut tissue = LinkTissue::new(setup)?;
-        let tells_of_others = setup.second_hand == SecondHand::Another;
-        if setup.second_hand == SecondHand::Own {
+        let tells_of_others = setup.second_hand == SecondLeader::Another;
+        if setup.second_hand == SecondLeader::Own {
             tissue.second = None;
         }
         let laws = Arc::new(Laws::new(setup.law.clone()));

@@ -27,7 +27,7 @@ pub(super) enum Rendering {
 
 /// Whose hand leads the second tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum SecondHand {
+pub(super) enum SecondLeader {
     /// Another client's: this client learns of it by samples
     Another,
     /// The other hand of this client, whose places go over the same network
@@ -36,13 +36,13 @@ pub(super) enum SecondHand {
     Unknown,
 }
 
-impl SecondHand {
+impl SecondLeader {
     /// Returns the name of the option's value, for tables and JSON.
     pub(super) fn name(self) -> &'static str {
         match self {
-            SecondHand::Another => "another",
-            SecondHand::Own => "own",
-            SecondHand::Unknown => "unknown",
+            SecondLeader::Another => "another",
+            SecondLeader::Own => "own",
+            SecondLeader::Unknown => "unknown",
         }
     }
 }
@@ -70,7 +70,7 @@ pub(super) struct Setup {
     pub(super) up_deadband: f64,
     /// Distance of a second tool from the place of the task, m; 0: there is no second tool.
     pub(super) second_m: f64,
-    pub(super) second_hand: SecondHand,
+    pub(super) second_hand: SecondLeader,
     /// A change of the tissue during the run.
     pub(super) change: Option<TissueChange>,
     pub(super) duration_s: f64,

@@ -70,6 +70,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
         tools: sample.tools.iter().map(|tool| tool_sample(tool, shape, paced.due_ns, now_ns)).collect(),
         other_tools: sample.other_tools.iter().map(touch::other_tool).collect(),
         instruments: Vec::new(),
+        other_instruments: Vec::new(),
     }
 }
 

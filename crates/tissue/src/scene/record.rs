@@ -115,7 +115,7 @@ pub struct ToolRecord {
 }
 
 /// The state of an instrument, whose tips are tools. Vectors are [x, y, z] in the tissue's frame.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct InstrumentRecord {
     /// The instrument's number in the script, from 0.
     pub instrument: u32,
@@ -137,6 +137,22 @@ pub struct InstrumentRecord {
     /// What its port and the hand that holds it exert; not written without a port.
     #[serde(flatten)]
     pub in_port: Option<PortRecord>,
+    /// The other instruments with which it overlaps; not written if there are none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub contacts: Vec<ContactRecord>,
+}
+
+/// An overlap of an instrument with another ([`palpate_haptics::instrument_contact`]). Vectors are [x, y, z] in the tissue's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ContactRecord {
+    /// The number of the other instrument in the script.
+    pub with_instrument: u32,
+    /// How far they overlap at most, m.
+    pub depth_m: f64,
+    /// Force of the other on this one, N.
+    pub force_n: [f64; 3],
+    /// Its torque about `place_m` of this one, N·m.
+    pub torque_n_m: [f64; 3],
 }
 
 /// What acts on an instrument in a port, so that it is in balance ([`palpate_haptics::port`]). Vectors are [x, y, z] in the tissue's

@@ -8,9 +8,9 @@ use glam::DVec3;
 use super::Change;
 pub use super::action::Action;
 use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile};
-use super::record::{InstrumentRecord, PortRecord, ToolRecord};
+use super::record::{ContactRecord, InstrumentRecord, PortRecord, ToolRecord};
 use crate::shape::{PointId, RestShape};
-use palpate_haptics::PortLoad;
+use palpate_haptics::{ContactLoad, InstrumentContact, InstrumentPose, PortLoad};
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
 /// ([`made_for`](super::script_reader::made_for)).
@@ -146,9 +146,32 @@ impl Script {
                     force_on_hand_n: array(on_hand.force_n),
                     torque_on_hand_n_m: array(on_hand.torque_n_m),
                 }),
+                contacts: self.contacts(number, &pose, time_s),
             })
         };
         self.instruments.iter().enumerate().filter_map(of).collect()
+    }
+
+    /// Returns the overlaps of an instrument at a pose with the others at a time, s.
+    fn contacts(&self, number: usize, pose: &InstrumentPose, time_s: f64) -> Vec<ContactRecord> {
+        let instrument = &self.instruments[number].instrument;
+        let mut contact = InstrumentContact::new(instrument);
+        let others = self.instruments.iter().enumerate().filter(|(other, _)| *other != number);
+        let overlap = |(number, other): (usize, &Arc<InstrumentProfile>)| {
+            let (other, pose_of_other) = (&other.instrument, other.at(time_s)?);
+            let capsules: Vec<_> = other.rows().iter().map(|row| other.capsule(*row, &pose_of_other)).collect();
+            #[allow(clippy::cast_possible_truncation)]
+            let number = number as u32;
+            let ContactLoad { wrench, depth_m } = contact.feel(instrument, pose, number, capsules.into_iter())?;
+            let array = |v: DVec3| (v + DVec3::ZERO).to_array();
+            Some(ContactRecord {
+                with_instrument: number,
+                depth_m,
+                force_n: array(wrench.force_n),
+                torque_n_m: array(wrench.torque_n_m),
+            })
+        };
+        others.filter_map(overlap).collect()
     }
 
     /// Returns the number of tools that the script uses: theirs are 0 to this − 1.
