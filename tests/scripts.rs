@@ -76,6 +76,25 @@ fn shipped_scripts_move_each_tissue_by_some_millimetres() {
     }
 }
 
+/// A lobe of the solid liver between the jaws of a grasper, which only touch.
+#[test]
+fn lift_lifts_a_lobe_and_lets_it_go() {
+    let scene = built_in("liver-solid", &[]);
+    let (records, summary) = run_whole(&model(&scene), &shipped("lift", &scene), false);
+    let at = |time_s: f64| records.iter().find(|record| record["time_s"].as_f64() >= Some(time_s)).unwrap();
+    let force_n = |time_s: f64| {
+        let parts = &at(time_s)["instruments"][0]["force_on_tool_n"];
+        DVec3::from_array([0, 1, 2].map(|axis| parts[axis].as_f64().unwrap()))
+    };
+    // What is lifted pulls down, and does not creep.
+    assert!(force_n(2.8).z < -0.05, "{}", force_n(2.8));
+    assert!(force_n(2.0).distance(force_n(2.8)) < 0.01 * force_n(2.8).length(), "{} {}", force_n(2.0), force_n(2.8));
+    // The rim of the lobe, beyond the jaws, goes farther than they do.
+    let moved_m = summary.largest_displacement_m;
+    assert!((0.01..0.04).contains(&moved_m) && summary.guard_events == 0, "{moved_m} m");
+    assert_eq!(records.last().unwrap()["instruments"], serde_json::Value::Null);
+}
+
 #[test]
 fn records_tell_what_a_tip_feels_and_where_it_is() {
     let scene = built_in("liver", &[]);

@@ -14,8 +14,9 @@ use palpate_haptics::{ContactLoad, InstrumentContact, InstrumentPose, PortLoad};
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
 /// ([`made_for`](super::script_reader::made_for)).
-pub const BUILT_IN: [(&str, &str); 7] = [
+pub const BUILT_IN: [(&str, &str); 8] = [
     ("grasp", include_str!("../../../../scripts/grasp.toml")),
+    ("lift", include_str!("../../../../scripts/lift.toml")),
     ("oblique-100", include_str!("../../../../scripts/oblique-100.toml")),
     ("oblique-60", include_str!("../../../../scripts/oblique-60.toml")),
     ("press", include_str!("../../../../scripts/press.toml")),
