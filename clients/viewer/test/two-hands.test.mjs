@@ -126,7 +126,7 @@ describe("two hands", () => {
     assert.equal(await page.page.inputValue("#strength"), "0.5");
     assert.ok(await page.page.locator("input[value=grasper]").isChecked());
     await keys.press("Escape");
-    await page.until(({ holds, hands: { both } }) => both.every(({ touches }) => !touches) && holds);
+    await page.until(({ hands: { both } }) => both.every(({ touches }) => !touches));
     // One hand: the second lets go.
     await page.page.uncheck("#two-hands", { force: true });
     await page.until(({ holds }) => !holds);

@@ -63,7 +63,7 @@ impl OtherInstrument {
                 place_m: instrument.tip_m(tip, pose),
                 velocity_m_per_s: instrument.tip_velocity_m_per_s(tip, pose, velocity),
             });
-            *capsule = Some(MovingCapsule { ends, radius_m: instrument.tips[row[0]].tip.radius_m });
+            *capsule = Some(MovingCapsule { ends, radius_m: instrument.capsule_radius_m(*row) });
         }
         OtherInstrument { first_tool, capsules }
     }

@@ -126,7 +126,7 @@ impl Binding<'_> {
         let of_tools = poses.iter().filter(|profile: &&PoseProfile| profile.mounted.is_none());
         let places_m = of_tools.flat_map(|profile| profile.poses.iter().map(|pose| pose.1));
         let of_instruments = instruments.iter().flat_map(|profile| profile.poses.iter().map(|pose| pose.1.place_m));
-        control_points.extend(places_m.chain(of_instruments).map(|place_m| self.scene.shape().nearest(place_m)));
+        control_points.extend(places_m.chain(of_instruments).map(|place_m| named_nearest(self.scene.shape(), place_m)));
         for (index, profile) in moves.iter().enumerate() {
             if moves[..index].iter().any(|other| other.point == profile.point) {
                 let message = "is prescribed by two tools";
@@ -728,4 +728,18 @@ fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<
         }
     }
     Ok(())
+}
+
+/// Returns the point nearest to a place, m, or of a solid, where several points have the name of one vertex, the one that is found by
+/// that name: a server must sample the point that a run does.
+fn named_nearest(of: &dyn shape::RestShape, place_m: DVec3) -> PointId {
+    let mut point = of.nearest(place_m);
+    // What is found may have the name of a third one.
+    for _ in 0..8 {
+        match of.find("point", of.name(point)) {
+            Ok(found) if found != point => point = found,
+            _ => break,
+        }
+    }
+    point
 }
