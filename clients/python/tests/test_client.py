@@ -41,15 +41,15 @@ class Handle(Hand):
 
     limits = "sigma7"
 
-    def __init__(self, orientation=(1.0, 0.0, 0.0, 0.0)):
+    def __init__(self, orientation=(1.0, 0.0, 0.0, 0.0), aside_m=0.0):
         super().__init__()
-        self.orientation, self.torques = orientation, []
+        self.orientation, self.aside_m, self.torques = orientation, aside_m, []
 
     def read(self):
         _, enable = super().read()
         # Forces begin while it is above the tissue, where it comes again and again.
         height_m = 0.001 + 0.002 * math.cos(2.0 * math.pi * self.readings / 1000.0)
-        return (0.0, 0.0, height_m), enable, self.orientation, 0.2
+        return (0.0, self.aside_m, height_m), enable, self.orientation, 0.2
 
     def write(self, force_n, torque_n_m):
         super().write(force_n)
@@ -245,7 +245,8 @@ class Clients(Served, unittest.TestCase):
             async with await server.create_session("liver") as session:
                 for _ in range(20):
                     hands = palpate.two_hands()
-                    handles = [Handle(), Handle((0.0, 0.0, 0.0, 1.0))]
+                    # Beside each other: instruments that begin within each other push at once, and forces do not begin.
+                    handles = [Handle(aside_m=0.012), Handle((0.0, 0.0, 0.0, 1.0), aside_m=-0.012)]
                     calls = [
                         session.touch(handles[number], seconds=3.0, instrument=instrument, tool=number * instrument.tips, hand=hand)
                         for number, hand in enumerate(hands)
