@@ -1175,8 +1175,8 @@ pub struct Sample {
     /// The instruments of this stream that have a pose.
     #[prost(message, repeated, tag = "17")]
     pub instruments: ::prost::alloc::vec::Vec<InstrumentSample>,
-    /// With TouchOpen.other_tools: the instruments of other streams of the session, at most 4. Their tips are also among
-    /// `other_tools`, while they are near the tissue.
+    /// With TouchOpen.other_tools: the instruments of other streams of the session, the first 4 by `first_tool`. Their
+    /// tips are also among `other_tools`, while they are near the tissue.
     #[prost(message, repeated, tag = "18")]
     pub other_instruments: ::prost::alloc::vec::Vec<OtherInstrument>,
 }
