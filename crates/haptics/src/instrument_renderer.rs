@@ -512,20 +512,19 @@ mod tests {
             self.renderer.as_second_hand(first_tool, &self.pose, now_s)
         }
 
+        /// Renders a tick at its pose, where a tissue that it does not touch is told by a sample, beside another hand. Returns the force, N.
+        fn render(&mut self, tick: u32, other: SecondHand, is_second: bool) -> DVec3 {
+            let (now_s, pose) = (f64::from(tick) * TICK_S, self.pose);
+            let wrench = Wrench::default();
+            self.renderer.receive(WrenchSample { sequence: tick.into(), client_time_s: now_s, pose, wrench }, now_s);
+            let others = if is_second { &[][..] } else { &[other.instrument] };
+            self.renderer.follow_instruments(is_second.then_some(other), others);
+            self.renderer.tick(now_s, &pose).force_n
+        }
+
         /// Goes on for a tick towards a target that moves.
         fn tick(&mut self, tick: u32, [from_m, to_m]: [DVec3; 2], other: SecondHand, is_second: bool) {
-            let now_s = f64::from(tick) * TICK_S;
-            let sample = WrenchSample {
-                sequence: tick.into(),
-                client_time_s: now_s,
-                pose: self.pose,
-                wrench: Wrench::default(),
-            };
-            self.renderer.receive(sample, now_s);
-            let second = is_second.then_some(other);
-            let others = if is_second { &[][..] } else { &[other.instrument] };
-            self.renderer.follow_instruments(second, others);
-            let force_n = self.renderer.tick(now_s, &self.pose).force_n;
+            let force_n = self.render(tick, other, is_second);
             let string_n = self.hand.string_n(from_m, self.state.place_m);
             self.state = self.hand.advance(self.state, from_m, to_m, force_n + string_n, TICK_S);
             self.pose.place_m = self.state.place_m;
@@ -592,16 +591,7 @@ mod tests {
                 // Its end turns up into the other shaft.
                 let angle = 0.03 * (f64::from(tick) - 1200.0).max(0.0) / 800.0;
                 hand.pose = InstrumentPose { orientation: DQuat::from_rotation_y(angle), ..middle };
-                let now_s = f64::from(tick) * TICK_S;
-                let sample = WrenchSample {
-                    sequence: tick.into(),
-                    client_time_s: now_s,
-                    pose: hand.pose,
-                    wrench: Wrench::default(),
-                };
-                hand.renderer.receive(sample, now_s);
-                hand.renderer.follow_instruments(Some(other.seen(30, now_s)), &[]);
-                hand.renderer.tick(now_s, &hand.pose);
+                hand.render(tick, other.seen(30, f64::from(tick) * TICK_S), true);
             }
             let (overlap_m, given_j) = (hand.renderer.overlap_m(), hand.renderer.given_j);
             assert!(overlap_m > 5e-4, "{device}: {overlap_m} m");

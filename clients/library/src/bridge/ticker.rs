@@ -449,7 +449,7 @@ impl LoopFeed {
         let law = message.map_or(Ok(Law::linear(0.0, 0.0)), law)?;
         self.connection += 1;
         (self.sample, self.wanted_s) = (None, 0.0);
-        (self.others, self.instruments) = ([None; MAX_OTHERS], [None; MAX_OTHER_INSTRUMENTS]);
+        self.forget_others();
         // Drops what the ticks have not taken of the connection before.
         self.waiting.clear();
         self.waiting.push_back(LoopEvent::Begin { connection: self.connection, law, origin_m });
@@ -491,20 +491,24 @@ impl LoopFeed {
         let told = told.or_else(|| model.map(|model| (NewestSample::Model(model), model.client_time_s)));
         if told.is_none() {
             // When the others were where is not known.
-            (self.others, self.instruments) = ([None; MAX_OTHERS], [None; MAX_OTHER_INSTRUMENTS]);
+            self.forget_others();
         }
         if let Some((told, time_s)) = told
             && self.sample.is_none_or(|newest| newest.sequence() < told.sequence())
         {
             self.sample = Some(told);
+            self.forget_others();
             let others = sample.other_tools.iter().map(|other| touch::from_other_tool(other, time_s));
-            self.others = [None; MAX_OTHERS];
             self.others.iter_mut().zip(others.flatten()).for_each(|(place, other)| *place = Some(other));
             let others = sample.other_instruments.iter().map(|other| instrument::from_other_instrument(other, time_s));
-            self.instruments = [None; MAX_OTHER_INSTRUMENTS];
             self.instruments.iter_mut().zip(others).for_each(|(place, other)| *place = Some(other));
         }
         self.pass_on();
+    }
+
+    /// Forgets the tools and instruments of other clients.
+    fn forget_others(&mut self) {
+        (self.others, self.instruments) = ([None; MAX_OTHERS], [None; MAX_OTHER_INSTRUMENTS]);
     }
 
     /// Passes on what fits. A model goes after the laws that arrived before it.
