@@ -22,8 +22,14 @@ use serde_json::json;
 /// Steps of one timing.
 const STEPS: usize = 20;
 
-const TIP: Tip =
-    Tip { shape: TipShape::Disc, radius_m: 0.005, friction: 0.0, grasps: false, coupling: Coupling::Constraint };
+const TIP: Tip = Tip {
+    shape: TipShape::Disc,
+    radius_m: 0.005,
+    friction: 0.0,
+    grasps: false,
+    coupling: Coupling::Constraint,
+    edge_m: DVec3::ZERO,
+};
 
 fn model(name: &str, sets: &[String]) -> Arc<Model> {
     let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;

@@ -50,7 +50,12 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         body: Body::Sheet(Sheet { points, spacing_m: any(&mut random), point_mass_kg: any(&mut random), fixed }),
         material: None,
         inclusions: Arc::default(),
-        springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, bending: random.bool() },
+        springs: Springs {
+            stiffness_n_per_m,
+            shear_stiffness_n_per_m,
+            bending: random.bool(),
+            pretension_n_per_m: 0.0,
+        },
         anchor_stiffness_n_per_m: or_zero(&mut random),
         damping_n_s_per_m: or_zero(&mut random),
         volume_stiffness_pa: 0.0,
@@ -67,6 +72,7 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         },
         sleep_tolerance: random.bool().then(|| decades(&mut random, -16.0, 0.0)),
         appearance: palpate_tissue::scene::Appearance::default(),
+        cutting: palpate_tissue::scene::Cutting::default(),
     }
 }
 

@@ -117,6 +117,7 @@ const TIP: Tip = Tip {
     friction: 0.0,
     grasps: false,
     coupling: palpate_haptics::Coupling::Constraint,
+    edge_m: DVec3::ZERO,
 };
 
 /// Moves a tool straight from one place to another in so many steps, and leaves it there for `rest` more.

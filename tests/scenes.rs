@@ -355,7 +355,10 @@ fn scenes_and_scripts_are_found_by_name() {
     refused(&palpate(&["run", "liverr", "mine"]), &["there is no scene `liverr`", "; did you mean `liver`?"]);
     refused(
         &palpate(&["run", "paper", "vertcal-60"]),
-        &["there is no script `vertcal-60`; there are grasp, lift, mine, oblique", "; did you mean `vertical-60`?"],
+        &[
+            "there is no script `vertcal-60`; there are cut, grasp, lift, mine, oblique",
+            "; did you mean `vertical-60`?",
+        ],
     );
     // A file in the folder, whose ending was left out.
     for name in ["firm", "poke"] {

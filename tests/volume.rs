@@ -126,8 +126,14 @@ fn what_nothing_damps_keeps_its_energy_and_what_nothing_holds_its_momentum() {
     }
 }
 
-const TIP: Tip =
-    Tip { shape: TipShape::Disc, radius_m: 0.02, friction: 0.2, grasps: false, coupling: Coupling::Constraint };
+const TIP: Tip = Tip {
+    shape: TipShape::Disc,
+    radius_m: 0.02,
+    friction: 0.2,
+    grasps: false,
+    coupling: Coupling::Constraint,
+    edge_m: DVec3::ZERO,
+};
 
 /// The same pressed in from above, by 10 % of its size, until all is steady.
 fn pressed(stiffness_pa: &str) -> Box<dyn Tissue> {

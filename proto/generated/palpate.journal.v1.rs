@@ -207,9 +207,12 @@ pub struct Tip {
     pub spring_n_per_m: ::core::option::Option<f64>,
     #[prost(double, tag = "5")]
     pub spring_n_s_per_m: f64,
-    /// 0 an even disc, 1 a rigid disc, 2 a sphere.
+    /// 0 an even disc, 1 a rigid disc, 2 a sphere, 3 a blade.
     #[prost(uint32, tag = "6")]
     pub shape: u32,
+    /// From the tip of a blade to its heel, m, in the tissue's frame.
+    #[prost(message, optional, tag = "7")]
+    pub edge_m: ::core::option::Option<crate::pb::Vector3>,
 }
 impl ::prost::Name for Tip {
     const NAME: &'static str = "Tip";

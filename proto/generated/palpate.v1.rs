@@ -351,9 +351,13 @@ pub struct Tip {
     /// Couples the tool by a spring; absent: the surface follows the tool exactly. Not for a rigid shape.
     #[prost(message, optional, tag = "4")]
     pub spring: ::core::option::Option<Spring>,
-    /// A rigid shape touches and does not grasp.
+    /// A rigid shape touches and does not grasp; a blade cuts.
     #[prost(enumeration = "TipShape", tag = "5")]
     pub shape: i32,
+    /// The edge of a blade, from its tip, at the tool's position, to its heel, m: in the tissue's frame, or, in the tips of an
+    /// `Instrument`, in that of the instrument. Absent for other shapes.
+    #[prost(message, optional, tag = "6")]
+    pub edge_m: ::core::option::Option<Vector3>,
 }
 impl ::prost::Name for Tip {
     const NAME: &'static str = "Tip";
@@ -1837,6 +1841,8 @@ pub enum TipShape {
     RigidDisc = 2,
     /// A rigid sphere. The tool's place is its centre. Solids only.
     Sphere = 3,
+    /// A blade, which severs what its edge crosses. The tool's place is the tip of the edge. Sheets and surfaces only.
+    Blade = 4,
 }
 impl TipShape {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1849,6 +1855,7 @@ impl TipShape {
             Self::Disc => "TIP_SHAPE_DISC",
             Self::RigidDisc => "TIP_SHAPE_RIGID_DISC",
             Self::Sphere => "TIP_SHAPE_SPHERE",
+            Self::Blade => "TIP_SHAPE_BLADE",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1858,6 +1865,7 @@ impl TipShape {
             "TIP_SHAPE_DISC" => Some(Self::Disc),
             "TIP_SHAPE_RIGID_DISC" => Some(Self::RigidDisc),
             "TIP_SHAPE_SPHERE" => Some(Self::Sphere),
+            "TIP_SHAPE_BLADE" => Some(Self::Blade),
             _ => None,
         }
     }
@@ -2765,6 +2773,9 @@ pub struct Scene {
     /// The accuracy that regions at rest may cost.
     #[prost(message, optional, tag = "7")]
     pub sleep: ::core::option::Option<Sleep>,
+    /// How the tissue resists a blade; absent: it does not.
+    #[prost(message, optional, tag = "14")]
+    pub cutting: ::core::option::Option<Cutting>,
 }
 impl ::prost::Name for Scene {
     const NAME: &'static str = "Scene";
@@ -3121,6 +3132,9 @@ pub struct Springs {
     /// to 10. Replaces `bending`.
     #[prost(double, optional, tag = "4")]
     pub bending_factor: ::core::option::Option<f64>,
+    /// Tension of the tissue at rest, the same in all directions, by which a cut gapes, N for each metre across; 0 or more.
+    #[prost(double, tag = "5")]
+    pub pretension_n_per_m: f64,
 }
 impl ::prost::Name for Springs {
     const NAME: &'static str = "Springs";
@@ -3130,6 +3144,26 @@ impl ::prost::Name for Springs {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Springs".into()
+    }
+}
+/// How a tissue resists a blade.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Cutting {
+    /// Fracture toughness: the work of a cut for each unit of its area, J/m²; 0 or more. 0: a blade feels nothing.
+    #[prost(double, tag = "1")]
+    pub toughness_j_per_m2: f64,
+    /// Thickness of what is cut, m; a blade that is deeper cuts no more. Absent: as deep as the blade is.
+    #[prost(double, optional, tag = "2")]
+    pub thickness_m: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Cutting {
+    const NAME: &'static str = "Cutting";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Cutting".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Cutting".into()
     }
 }
 /// The force −K″·u at every point, with u the displacement from rest.
@@ -3665,6 +3699,15 @@ pub struct Session {
     /// moved, and on a server without audits.
     #[prost(message, optional, tag = "35")]
     pub mesh_error_estimate: ::core::option::Option<MeshErrorEstimate>,
+    /// The version of what joins the points of the tissue (ViewService.GetTopology): 0 if nothing was severed.
+    #[prost(uint32, tag = "36")]
+    pub topology_version: u32,
+    /// Number of severed springs.
+    #[prost(uint32, tag = "37")]
+    pub severed: u32,
+    /// Number of parts of the tissue; 1 if it is whole.
+    #[prost(uint32, tag = "38")]
+    pub pieces: u32,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";
@@ -6315,6 +6358,82 @@ impl ::prost::Name for VertexGroup {
     }
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetTopologyRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// The version that the client knows: then only what was severed since, if that is all that has changed. 0: everything.
+    #[prost(uint32, tag = "2")]
+    pub since_version: u32,
+}
+impl ::prost::Name for GetTopologyRequest {
+    const NAME: &'static str = "GetTopologyRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GetTopologyRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GetTopologyRequest".into()
+    }
+}
+/// A part of what blades have severed. The lists of all parts, concatenated, are the whole.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetTopologyResponse {
+    /// The version of what joins the points: it grows with each step in which anything is severed, and if the server undoes a cut. Frames
+    /// have it.
+    #[prost(uint32, tag = "1")]
+    pub version: u32,
+    /// Whether the list begins after `since_version`; otherwise it replaces what the client knows.
+    #[prost(bool, tag = "2")]
+    pub continues: bool,
+    /// In the order in which they were severed.
+    #[prost(message, repeated, tag = "3")]
+    pub severed: ::prost::alloc::vec::Vec<SeveredSpring>,
+    /// Number of parts of the tissue; 1 if it is whole.
+    #[prost(uint32, tag = "4")]
+    pub pieces: u32,
+    /// Whether this is the last part.
+    #[prost(bool, tag = "5")]
+    pub last: bool,
+}
+impl ::prost::Name for GetTopologyResponse {
+    const NAME: &'static str = "GetTopologyResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GetTopologyResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GetTopologyResponse".into()
+    }
+}
+/// A severed spring.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct SeveredSpring {
+    /// The vertices that it joined, as indices of a frame of refinement 0. Absent if frames show other vertices than are simulated.
+    #[prost(uint32, optional, tag = "1")]
+    pub first_vertex: ::core::option::Option<u32>,
+    #[prost(uint32, optional, tag = "2")]
+    pub second_vertex: ::core::option::Option<u32>,
+    /// Where it was severed: the part of the way from the first to the second, 0 to 1.
+    #[prost(float, tag = "3")]
+    pub part: f32,
+    /// That place at rest, m.
+    #[prost(message, optional, tag = "4")]
+    pub rest_m: ::core::option::Option<Vector3>,
+    /// The version since which it is severed.
+    #[prost(uint32, tag = "5")]
+    pub version: u32,
+}
+impl ::prost::Name for SeveredSpring {
+    const NAME: &'static str = "SeveredSpring";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.SeveredSpring".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.SeveredSpring".into()
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetTextureRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
@@ -6436,6 +6555,9 @@ pub struct WatchFramesResponse {
     /// Whether this is the last part of the frame.
     #[prost(bool, tag = "16")]
     pub last: bool,
+    /// The version of what joins the points (GetTopology); 0 if nothing was severed.
+    #[prost(uint32, tag = "17")]
+    pub topology_version: u32,
 }
 impl ::prost::Name for WatchFramesResponse {
     const NAME: &'static str = "WatchFramesResponse";
@@ -6643,6 +6765,31 @@ pub mod view_service_client {
                 .insert(GrpcMethod::new("palpate.v1.ViewService", "GetMesh"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// Returns what blades have severed, in parts.
+        pub async fn get_topology(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetTopologyRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::GetTopologyResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ViewService/GetTopology",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ViewService", "GetTopology"));
+            self.inner.server_streaming(req, path, codec).await
+        }
         /// Returns the image of the tissue's surface, in parts.
         pub async fn get_texture(
             &mut self,
@@ -6746,6 +6893,20 @@ pub mod view_service_server {
             &self,
             request: tonic::Request<super::GetMeshRequest>,
         ) -> std::result::Result<tonic::Response<Self::GetMeshStream>, tonic::Status>;
+        /// Server streaming response type for the GetTopology method.
+        type GetTopologyStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::GetTopologyResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns what blades have severed, in parts.
+        async fn get_topology(
+            &self,
+            request: tonic::Request<super::GetTopologyRequest>,
+        ) -> std::result::Result<
+            tonic::Response<Self::GetTopologyStream>,
+            tonic::Status,
+        >;
         /// Server streaming response type for the GetTexture method.
         type GetTextureStream: tonic::codegen::tokio_stream::Stream<
                 Item = std::result::Result<super::GetTextureResponse, tonic::Status>,
@@ -6888,6 +7049,52 @@ pub mod view_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetMeshSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ViewService/GetTopology" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetTopologySvc<T: ViewService>(pub Arc<T>);
+                    impl<
+                        T: ViewService,
+                    > tonic::server::ServerStreamingService<super::GetTopologyRequest>
+                    for GetTopologySvc<T> {
+                        type Response = super::GetTopologyResponse;
+                        type ResponseStream = T::GetTopologyStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetTopologyRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ViewService>::get_topology(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetTopologySvc(inner);
                         let codec = crate::codec::BoundedCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -77,6 +77,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Message(18) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(0) },
 ] },
 Shape { name: "palpate.v1.Instrument", bytes: size_of::<crate::pb::Instrument>(), decode: |bytes| <crate::pb::Instrument as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -439,12 +440,13 @@ Field { number: 12, is_list: false, kind: FieldKind::Message(67) },
 Field { number: 9, is_list: false, kind: FieldKind::Message(72) },
 Field { number: 10, is_list: true, kind: FieldKind::Message(73) },
 Field { number: 3, is_list: false, kind: FieldKind::Message(74) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(75) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(76) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(77) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(76) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(77) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(78) },
 Field { number: 13, is_list: false, kind: FieldKind::Message(64) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(78) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(79) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(79) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(80) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(75) },
 ] },
 Shape { name: "palpate.v1.Gravity", bytes: size_of::<crate::pb::Gravity>(), decode: |bytes| <crate::pb::Gravity as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
@@ -519,6 +521,11 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
+] },
+Shape { name: "palpate.v1.Cutting", bytes: size_of::<crate::pb::Cutting>(), decode: |bytes| <crate::pb::Cutting as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.AnchorSprings", bytes: size_of::<crate::pb::AnchorSprings>(), decode: |bytes| <crate::pb::AnchorSprings as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -552,7 +559,7 @@ Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.UploadMeshResponse", bytes: size_of::<crate::pb::UploadMeshResponse>(), decode: |bytes| <crate::pb::UploadMeshResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(84) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(85) },
 Field { number: 4, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.UploadJournalRequest", bytes: size_of::<crate::pb::UploadJournalRequest>(), decode: |bytes| <crate::pb::UploadJournalRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -564,7 +571,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.UploadJournalResponse", bytes: size_of::<crate::pb::UploadJournalResponse>(), decode: |bytes| <crate::pb::UploadJournalResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(129) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(130) },
 ] },
 Shape { name: "palpate.v1.MeshReport", bytes: size_of::<crate::pb::MeshReport>(), decode: |bytes| <crate::pb::MeshReport as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -574,7 +581,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Message(8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 8, is_list: true, kind: FieldKind::Message(85) },
+Field { number: 8, is_list: true, kind: FieldKind::Message(86) },
 Field { number: 9, is_list: true, kind: FieldKind::Text },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
@@ -592,7 +599,7 @@ Field { number: 1, is_list: true, kind: FieldKind::Text },
 Shape { name: "palpate.v1.CreateSessionRequest", bytes: size_of::<crate::pb::CreateSessionRequest>(), decode: |bytes| <crate::pb::CreateSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Message(63) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(89) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(90) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
@@ -605,7 +612,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.CreateSessionResponse", bytes: size_of::<crate::pb::CreateSessionResponse>(), decode: |bytes| <crate::pb::CreateSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(91) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(92) },
 ] },
 Shape { name: "palpate.v1.Session", bytes: size_of::<crate::pb::Session>(), decode: |bytes| <crate::pb::Session as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -620,7 +627,7 @@ Field { number: 9, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 11, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Text },
-Field { number: 13, is_list: true, kind: FieldKind::Message(104) },
+Field { number: 13, is_list: true, kind: FieldKind::Message(105) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 15, is_list: true, kind: FieldKind::Text },
 Field { number: 16, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -632,17 +639,20 @@ Field { number: 21, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 22, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 23, is_list: false, kind: FieldKind::Text },
 Field { number: 24, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 25, is_list: false, kind: FieldKind::Message(103) },
-Field { number: 26, is_list: false, kind: FieldKind::Message(100) },
+Field { number: 25, is_list: false, kind: FieldKind::Message(104) },
+Field { number: 26, is_list: false, kind: FieldKind::Message(101) },
 Field { number: 27, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 28, is_list: true, kind: FieldKind::Message(99) },
+Field { number: 28, is_list: true, kind: FieldKind::Message(100) },
 Field { number: 29, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 30, is_list: false, kind: FieldKind::Message(8) },
-Field { number: 31, is_list: false, kind: FieldKind::Message(98) },
-Field { number: 32, is_list: false, kind: FieldKind::Message(97) },
-Field { number: 33, is_list: false, kind: FieldKind::Message(94) },
-Field { number: 34, is_list: true, kind: FieldKind::Message(93) },
-Field { number: 35, is_list: false, kind: FieldKind::Message(92) },
+Field { number: 31, is_list: false, kind: FieldKind::Message(99) },
+Field { number: 32, is_list: false, kind: FieldKind::Message(98) },
+Field { number: 33, is_list: false, kind: FieldKind::Message(95) },
+Field { number: 34, is_list: true, kind: FieldKind::Message(94) },
+Field { number: 35, is_list: false, kind: FieldKind::Message(93) },
+Field { number: 36, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 37, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 38, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.MeshErrorEstimate", bytes: size_of::<crate::pb::MeshErrorEstimate>(), decode: |bytes| <crate::pb::MeshErrorEstimate as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -665,7 +675,7 @@ Shape { name: "palpate.v1.LocateSessionRequest", bytes: size_of::<crate::pb::Loc
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.LocateSessionResponse", bytes: size_of::<crate::pb::LocateSessionResponse>(), decode: |bytes| <crate::pb::LocateSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(94) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(95) },
 ] },
 Shape { name: "palpate.v1.Playback", bytes: size_of::<crate::pb::Playback>(), decode: |bytes| <crate::pb::Playback as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -692,12 +702,12 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 Shape { name: "palpate.v1.Audit", bytes: size_of::<crate::pb::Audit>(), decode: |bytes| <crate::pb::Audit as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(101) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(101) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(102) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(102) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(102) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(103) },
 Field { number: 9, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.AuditedError", bytes: size_of::<crate::pb::AuditedError>(), decode: |bytes| <crate::pb::AuditedError as Message>::decode(bytes).is_ok(), fields: &[
@@ -706,7 +716,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.Correction", bytes: size_of::<crate::pb::Correction>(), decode: |bytes| <crate::pb::Correction as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(101) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(102) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Text },
 Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -729,12 +739,12 @@ Shape { name: "palpate.v1.GetSessionRequest", bytes: size_of::<crate::pb::GetSes
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.GetSessionResponse", bytes: size_of::<crate::pb::GetSessionResponse>(), decode: |bytes| <crate::pb::GetSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(91) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(92) },
 ] },
 Shape { name: "palpate.v1.ListSessionsRequest", bytes: size_of::<crate::pb::ListSessionsRequest>(), decode: |bytes| <crate::pb::ListSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListSessionsResponse", bytes: size_of::<crate::pb::ListSessionsResponse>(), decode: |bytes| <crate::pb::ListSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(91) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(92) },
 ] },
 Shape { name: "palpate.v1.DeleteSessionRequest", bytes: size_of::<crate::pb::DeleteSessionRequest>(), decode: |bytes| <crate::pb::DeleteSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -765,7 +775,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.UpdateTissueResponse", bytes: size_of::<crate::pb::UpdateTissueResponse>(), decode: |bytes| <crate::pb::UpdateTissueResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(91) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(92) },
 ] },
 Shape { name: "palpate.v1.PauseSessionRequest", bytes: size_of::<crate::pb::PauseSessionRequest>(), decode: |bytes| <crate::pb::PauseSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -800,7 +810,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListJournalsRequest", bytes: size_of::<crate::pb::ListJournalsRequest>(), decode: |bytes| <crate::pb::ListJournalsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListJournalsResponse", bytes: size_of::<crate::pb::ListJournalsResponse>(), decode: |bytes| <crate::pb::ListJournalsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(127) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(128) },
 ] },
 Shape { name: "palpate.v1.JournalInfo", bytes: size_of::<crate::pb::JournalInfo>(), decode: |bytes| <crate::pb::JournalInfo as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -818,11 +828,11 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.GetJournalResponse", bytes: size_of::<crate::pb::GetJournalResponse>(), decode: |bytes| <crate::pb::GetJournalResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(127) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(128) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(130) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(131) },
 Field { number: 6, is_list: true, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.ForceMoment", bytes: size_of::<crate::pb::ForceMoment>(), decode: |bytes| <crate::pb::ForceMoment as Message>::decode(bytes).is_ok(), fields: &[
@@ -848,11 +858,29 @@ Field { number: 5, is_list: true, kind: FieldKind::Number(4, 4) },
 Field { number: 6, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: true, kind: FieldKind::Number(4, 0) },
-Field { number: 9, is_list: true, kind: FieldKind::Message(135) },
+Field { number: 9, is_list: true, kind: FieldKind::Message(136) },
 ] },
 Shape { name: "palpate.v1.VertexGroup", bytes: size_of::<crate::pb::VertexGroup>(), decode: |bytes| <crate::pb::VertexGroup as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
+] },
+Shape { name: "palpate.v1.GetTopologyRequest", bytes: size_of::<crate::pb::GetTopologyRequest>(), decode: |bytes| <crate::pb::GetTopologyRequest as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Text },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+] },
+Shape { name: "palpate.v1.GetTopologyResponse", bytes: size_of::<crate::pb::GetTopologyResponse>(), decode: |bytes| <crate::pb::GetTopologyResponse as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(139) },
+Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
+] },
+Shape { name: "palpate.v1.SeveredSpring", bytes: size_of::<crate::pb::SeveredSpring>(), decode: |bytes| <crate::pb::SeveredSpring as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(0) },
+Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.GetTextureRequest", bytes: size_of::<crate::pb::GetTextureRequest>(), decode: |bytes| <crate::pb::GetTextureRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -886,8 +914,9 @@ Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 13, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 15, is_list: true, kind: FieldKind::Message(140) },
+Field { number: 15, is_list: true, kind: FieldKind::Message(144) },
 Field { number: 16, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 17, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.Patch", bytes: size_of::<crate::pb::Patch>(), decode: |bytes| <crate::pb::Patch as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -905,7 +934,7 @@ Shape { name: "palpate.v1.AcknowledgeFramesResponse", bytes: size_of::<crate::pb
 Shape { name: "palpate.v1.ListNodesRequest", bytes: size_of::<crate::pb::ListNodesRequest>(), decode: |bytes| <crate::pb::ListNodesRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListNodesResponse", bytes: size_of::<crate::pb::ListNodesResponse>(), decode: |bytes| <crate::pb::ListNodesResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(145) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(149) },
 ] },
 Shape { name: "palpate.v1.Node", bytes: size_of::<crate::pb::Node>(), decode: |bytes| <crate::pb::Node as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -920,11 +949,11 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListFleetSessionsRequest", bytes: size_of::<crate::pb::ListFleetSessionsRequest>(), decode: |bytes| <crate::pb::ListFleetSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListFleetSessionsResponse", bytes: size_of::<crate::pb::ListFleetSessionsResponse>(), decode: |bytes| <crate::pb::ListFleetSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(148) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(152) },
 ] },
 Shape { name: "palpate.v1.FleetSession", bytes: size_of::<crate::pb::FleetSession>(), decode: |bytes| <crate::pb::FleetSession as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(94) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(95) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.MoveSessionRequest", bytes: size_of::<crate::pb::MoveSessionRequest>(), decode: |bytes| <crate::pb::MoveSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -932,7 +961,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MoveSessionResponse", bytes: size_of::<crate::pb::MoveSessionResponse>(), decode: |bytes| <crate::pb::MoveSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(94) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(95) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.DrainNodeRequest", bytes: size_of::<crate::pb::DrainNodeRequest>(), decode: |bytes| <crate::pb::DrainNodeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -947,7 +976,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.ListCallersRequest", bytes: size_of::<crate::pb::ListCallersRequest>(), decode: |bytes| <crate::pb::ListCallersRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListCallersResponse", bytes: size_of::<crate::pb::ListCallersResponse>(), decode: |bytes| <crate::pb::ListCallersResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(155) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(159) },
 ] },
 Shape { name: "palpate.v1.CallerUse", bytes: size_of::<crate::pb::CallerUse>(), decode: |bytes| <crate::pb::CallerUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -961,7 +990,7 @@ Shape { name: "palpate.v1.ListStreamsRequest", bytes: size_of::<crate::pb::ListS
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.ListStreamsResponse", bytes: size_of::<crate::pb::ListStreamsResponse>(), decode: |bytes| <crate::pb::ListStreamsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(158) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(162) },
 ] },
 Shape { name: "palpate.v1.StreamUse", bytes: size_of::<crate::pb::StreamUse>(), decode: |bytes| <crate::pb::StreamUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
@@ -999,22 +1028,22 @@ Shape { name: "palpate.v1.ReviveSessionResponse", bytes: size_of::<crate::pb::Re
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.CreateHereRequest", bytes: size_of::<crate::pb::CreateHereRequest>(), decode: |bytes| <crate::pb::CreateHereRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(88) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(89) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.CreateHereResponse", bytes: size_of::<crate::pb::CreateHereResponse>(), decode: |bytes| <crate::pb::CreateHereResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(91) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(92) },
 ] },
 Shape { name: "palpate.v1.MirrorRequest", bytes: size_of::<crate::pb::MirrorRequest>(), decode: |bytes| <crate::pb::MirrorRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(170) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(171) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(173) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(174) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(175) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(177) },
 ] },
 Shape { name: "palpate.v1.MirrorOpen", bytes: size_of::<crate::pb::MirrorOpen>(), decode: |bytes| <crate::pb::MirrorOpen as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorParts", bytes: size_of::<crate::pb::MirrorParts>(), decode: |bytes| <crate::pb::MirrorParts as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(172) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(176) },
 ] },
 Shape { name: "palpate.v1.MirrorPart", bytes: size_of::<crate::pb::MirrorPart>(), decode: |bytes| <crate::pb::MirrorPart as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1026,7 +1055,7 @@ Shape { name: "palpate.v1.MirrorEnd", bytes: size_of::<crate::pb::MirrorEnd>(), 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorResponse", bytes: size_of::<crate::pb::MirrorResponse>(), decode: |bytes| <crate::pb::MirrorResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(175) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(179) },
 ] },
 Shape { name: "palpate.v1.Mirrored", bytes: size_of::<crate::pb::Mirrored>(), decode: |bytes| <crate::pb::Mirrored as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1035,13 +1064,13 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.TakeSessionRequest", bytes: size_of::<crate::pb::TakeSessionRequest>(), decode: |bytes| <crate::pb::TakeSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(177) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(181) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.TakeOver", bytes: size_of::<crate::pb::TakeOver>(), decode: |bytes| <crate::pb::TakeOver as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(179) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(178) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(183) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(182) },
 ] },
 Shape { name: "palpate.v1.KnownLaw", bytes: size_of::<crate::pb::KnownLaw>(), decode: |bytes| <crate::pb::KnownLaw as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1062,17 +1091,17 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(182) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(186) },
 ] },
 Shape { name: "palpate.journal.v1.Input", bytes: size_of::<crate::journal::Input>(), decode: |bytes| <crate::journal::Input as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(183) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(189) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(190) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(191) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(192) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(193) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(194) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(187) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(193) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(194) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(195) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(196) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(197) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(198) },
 ] },
 Shape { name: "palpate.journal.v1.Command", bytes: size_of::<crate::journal::Command>(), decode: |bytes| <crate::journal::Command as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1084,10 +1113,10 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(184) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(185) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(186) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(188) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(188) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(189) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(190) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(192) },
 ] },
 Shape { name: "palpate.journal.v1.Push", bytes: size_of::<crate::journal::Push>(), decode: |bytes| <crate::journal::Push as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1103,7 +1132,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
 Shape { name: "palpate.journal.v1.Pose", bytes: size_of::<crate::journal::Pose>(), decode: |bytes| <crate::journal::Pose as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(187) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(191) },
 ] },
 Shape { name: "palpate.journal.v1.Tip", bytes: size_of::<crate::journal::Tip>(), decode: |bytes| <crate::journal::Tip as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1112,6 +1141,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(0) },
 ] },
 Shape { name: "palpate.journal.v1.Release", bytes: size_of::<crate::journal::Release>(), decode: |bytes| <crate::journal::Release as Message>::decode(bytes).is_ok(), fields: &[
 ] },
@@ -1152,23 +1182,23 @@ Shape { name: "palpate.journal.v1.Snapshot", bytes: size_of::<crate::journal::Sn
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(189) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(193) },
 Field { number: 5, is_list: false, kind: FieldKind::Text },
 Field { number: 6, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Felt", bytes: size_of::<crate::journal::Felt>(), decode: |bytes| <crate::journal::Felt as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(198) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(202) },
 ] },
 Shape { name: "palpate.journal.v1.Moment", bytes: size_of::<crate::journal::Moment>(), decode: |bytes| <crate::journal::Moment as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(199) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(203) },
 ] },
 Shape { name: "palpate.journal.v1.FeltTool", bytes: size_of::<crate::journal::FeltTool>(), decode: |bytes| <crate::journal::FeltTool as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(200) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(200) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(204) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(204) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(204) },
 ] },
 Shape { name: "palpate.journal.v1.Vector", bytes: size_of::<crate::journal::Vector>(), decode: |bytes| <crate::journal::Vector as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 4) },
@@ -1176,7 +1206,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 ] },
 Shape { name: "palpate.journal.v1.Waiting", bytes: size_of::<crate::journal::Waiting>(), decode: |bytes| <crate::journal::Waiting as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(182) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(186) },
 ] },
 Shape { name: "palpate.journal.v1.Signature", bytes: size_of::<crate::journal::Signature>(), decode: |bytes| <crate::journal::Signature as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1198,17 +1228,17 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(63) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(205) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(208) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(189) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(209) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(212) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(193) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal::TriangleMesh>(), decode: |bytes| <crate::journal::TriangleMesh as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(207) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(206) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(211) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(210) },
 ] },
 Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1254,7 +1284,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(211) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(215) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1270,8 +1300,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(211) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(215) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1282,7 +1312,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1291,20 +1321,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(214) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(216) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(220) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(222) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(215) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(217) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(219) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(219) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(221) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(223) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1316,20 +1346,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(222) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(220) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(220) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(226) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(224) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(224) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(221) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(225) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(226) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(227) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(231) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1344,14 +1374,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(212) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(216) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1360,7 +1390,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1370,7 +1400,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1378,7 +1408,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1389,7 +1419,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1397,7 +1427,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(217) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

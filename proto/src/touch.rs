@@ -59,6 +59,7 @@ pub fn from_tip(field: &str, tip: Option<&pb::Tip>) -> Result<Tip> {
             pb::TipShape::Unspecified | pb::TipShape::Disc => TipShape::Disc,
             pb::TipShape::RigidDisc => TipShape::RigidDisc,
             pb::TipShape::Sphere => TipShape::Sphere,
+            pb::TipShape::Blade => TipShape::Blade,
         },
         radius_m: tip.radius_m,
         friction: tip.friction.unwrap_or(Tip::default().friction),
@@ -67,6 +68,7 @@ pub fn from_tip(field: &str, tip: Option<&pb::Tip>) -> Result<Tip> {
             stiffness_n_per_m: spring.stiffness_n_per_m,
             damping_n_s_per_m: spring.damping_n_s_per_m,
         }),
+        edge_m: from_vector(tip.edge_m.as_ref()),
     })
 }
 
@@ -76,6 +78,7 @@ pub fn tip(tip: &Tip) -> pb::Tip {
         TipShape::Disc => pb::TipShape::Unspecified,
         TipShape::RigidDisc => pb::TipShape::RigidDisc,
         TipShape::Sphere => pb::TipShape::Sphere,
+        TipShape::Blade => pb::TipShape::Blade,
     };
     pb::Tip {
         shape: shape.into(),
@@ -88,6 +91,7 @@ pub fn tip(tip: &Tip) -> pb::Tip {
                 Some(pb::Spring { stiffness_n_per_m, damping_n_s_per_m })
             }
         },
+        edge_m: (tip.edge_m != DVec3::ZERO).then(|| vector(tip.edge_m)).flatten(),
     }
 }
 

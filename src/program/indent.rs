@@ -141,6 +141,7 @@ fn text(indentation: &Indentation, indented: &Indented, model: &Model) -> String
         TipShape::Disc => "even pressure on a disc",
         TipShape::RigidDisc => "rigid disc",
         TipShape::Sphere => "rigid sphere",
+        TipShape::Blade => "blade",
     };
     let mut text = format!(
         "{} at ({x:.2}, {y:.2}, {z:.2}) mm, {tip} of radius {radius_mm:.3} mm, {speed:.3} mm/s\n\n\

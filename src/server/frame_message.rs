@@ -34,6 +34,7 @@ pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec
         time_dilation: delivery.time_dilation,
         patches: Vec::new(),
         last: false,
+        topology_version: frame.topology_version,
     };
     let mut messages: Vec<pb::WatchFramesResponse> = Vec::new();
     let mut room = 0;

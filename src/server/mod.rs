@@ -43,6 +43,7 @@ mod status;
 mod stream_termination;
 mod textures;
 mod tls;
+mod topology_parts;
 #[cfg(feature = "otlp")]
 pub mod traces;
 mod traffic;

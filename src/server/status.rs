@@ -53,6 +53,10 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
             waiting: counts.waiting,
             refused: handle.refused(),
         }),
+        topology_version: status.cuts.version(),
+        severed: count(status.cuts.len()),
+        // Counting looks at all springs.
+        pieces: if status.cuts.is_empty() { 1 } else { count(status.cuts.pieces(model)) },
         awake_points: count(status.awake_points),
         streams: count(handle.streams()),
         scene_name: model.scene.name.clone(),

@@ -15,6 +15,7 @@ use super::frame_message::frame_messages;
 use super::mesh_parts::mesh_part;
 use super::services::Services;
 use super::stream_termination::until_cut;
+use super::topology_parts::TopologyParts;
 use palpate_realtime::frames::Viewer;
 use palpate_realtime::ids::random_id;
 use palpate_realtime::{FrameReader, StreamGuard, StreamKind};
@@ -67,6 +68,7 @@ impl ViewStream {
 #[tonic::async_trait]
 impl ViewService for Views {
     type GetMeshStream = ViewMessages<pb::GetMeshResponse>;
+    type GetTopologyStream = ViewMessages<pb::GetTopologyResponse>;
     type GetTextureStream = ViewMessages<pb::GetTextureResponse>;
     type WatchFramesStream = ViewMessages<pb::WatchFramesResponse>;
 
@@ -80,6 +82,25 @@ impl ViewService for Views {
         let skin = handle.skin.clone();
         let out = stream::unfold((0, guard, skin), move |(part, guard, skin)| async move {
             mesh_part(skin.as_deref(), grid, part).map(|message| (Ok(message), (part + 1, guard, skin)))
+        });
+        Ok(Response::new(until_cut(out, cut)))
+    }
+
+    async fn get_topology(
+        &self,
+        request: Request<pb::GetTopologyRequest>,
+    ) -> Result<Response<Self::GetTopologyStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let pb::GetTopologyRequest { session_id, since_version } = request.into_inner();
+        let handle = self.0.session(&session_id).await?;
+        let guard = handle.open_stream("GetTopology", StreamKind::ReadsOnly, &account)?;
+        let cut = guard.cut().clone();
+        let begin = Some((TopologyParts::new(&handle, since_version), guard));
+        let out = stream::unfold(begin, |rest| async move {
+            let (mut parts, guard) = rest?;
+            let message = parts.next();
+            let last = message.last;
+            Some((Ok(message), (!last).then_some((parts, guard))))
         });
         Ok(Response::new(until_cut(out, cut)))
     }

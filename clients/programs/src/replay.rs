@@ -470,6 +470,7 @@ async fn play(
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
         computed_fraction: measured.computed as f64 / (script.steps * points as u64) as f64,
         guard_events: 0,
+        topology: None,
         mesh_error_estimate: None,
         final_hash: final_hash.unwrap_or_default(),
         stages: Vec::new(),

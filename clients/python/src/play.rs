@@ -223,6 +223,7 @@ pub(crate) async fn play(
         // The server does not report it.
         computed_fraction: f64::NAN,
         guard_events: 0,
+        topology: None,
         final_hash,
         audited_error: None,
         mesh_error_estimate: None,

@@ -29,7 +29,7 @@ impl Tip {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        Ok(Tip(palpate_haptics::Tip { shape, radius_m, friction, grasps, coupling }))
+        Ok(Tip(palpate_haptics::Tip { shape, radius_m, friction, grasps, coupling, ..palpate_haptics::Tip::default() }))
     }
 
     /// The shape: disc, rigid or sphere.

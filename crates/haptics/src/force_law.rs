@@ -96,7 +96,7 @@ impl Law {
         let of_row = |(number, row): (usize, &Row)| {
             let (force_n, stiffness_n_per_m, touching) = match shape {
                 TipShape::Sphere => of_sphere(number as f64 * self.step_m),
-                TipShape::RigidDisc | TipShape::Disc => {
+                TipShape::RigidDisc | TipShape::Disc | TipShape::Blade => {
                     (RIGID_TO_EVEN * row.force_n, RIGID_TO_EVEN * row.stiffness_n_per_m, 1.0)
                 }
             };

@@ -183,6 +183,15 @@ impl Instrument {
         pose.place_m + pose.orientation * in_frame_m
     }
 
+    /// Returns a tip by its number, with the edge of a blade in the tissue's frame. Panics if there is no such tip.
+    pub fn tip(&self, number: usize, pose: &InstrumentPose) -> Tip {
+        let InstrumentTip { tip, part, .. } = self.tips[number];
+        if tip.edge_m == DVec3::ZERO {
+            return tip;
+        }
+        Tip { edge_m: pose.orientation * (about_z(part.turn() * pose.jaw_rad) * tip.edge_m), ..tip }
+    }
+
     /// Returns the velocity of a tip by its number, m/s, in the tissue's frame. Panics if there is no such tip.
     pub fn tip_velocity_m_per_s(&self, number: usize, pose: &InstrumentPose, velocity: &InstrumentVelocity) -> DVec3 {
         let (axis, hinge_m) = self.hinge(pose);

@@ -2,6 +2,8 @@
 
 use std::str::FromStr;
 
+use glam::DVec3;
+
 /// Coupling between a tool and the surface that it touches: how the place of the one follows from the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coupling {
@@ -29,11 +31,13 @@ pub enum TipShape {
     RigidDisc,
     /// A rigid sphere. The place of the tool is its centre.
     Sphere,
+    /// A blade, which severs what its edge crosses. The place of the tool is the tip of the edge ([`Tip::edge_m`]).
+    Blade,
 }
 
 impl TipShape {
     /// All shapes, in the order of their numbers in journals.
-    pub const ALL: [Self; 3] = [TipShape::Disc, TipShape::RigidDisc, TipShape::Sphere];
+    pub const ALL: [Self; 4] = [TipShape::Disc, TipShape::RigidDisc, TipShape::Sphere, TipShape::Blade];
 
     /// Returns the name in scripts.
     pub fn name(self) -> &'static str {
@@ -41,12 +45,13 @@ impl TipShape {
             TipShape::Disc => "disc",
             TipShape::RigidDisc => "rigid",
             TipShape::Sphere => "sphere",
+            TipShape::Blade => "blade",
         }
     }
 
     /// Returns whether the tissue takes the shape of the tip, so that its pressure is part of the solution.
     pub fn is_rigid(self) -> bool {
-        self != TipShape::Disc
+        matches!(self, TipShape::RigidDisc | TipShape::Sphere)
     }
 
     /// Returns the distance of the tool's place from the surface when a tip of `radius_m` (m) just touches, m.
@@ -78,11 +83,21 @@ pub struct Tip {
     pub grasps: bool,
     /// Coupling between the tool and the surface.
     pub coupling: Coupling,
+    /// The edge of a blade, from its tip to its heel, m, in the tissue's frame; in an instrument's tips, in the instrument's frame. 0
+    /// for every other shape.
+    pub edge_m: DVec3,
 }
 
 impl Default for Tip {
     /// Returns the tip of a finger on wet tissue: a disc of 5 mm, μ = 0.2, no grasp, a constraint.
     fn default() -> Self {
-        Tip { shape: TipShape::Disc, radius_m: 0.005, friction: 0.2, grasps: false, coupling: Coupling::Constraint }
+        Tip {
+            shape: TipShape::Disc,
+            radius_m: 0.005,
+            friction: 0.2,
+            grasps: false,
+            coupling: Coupling::Constraint,
+            edge_m: DVec3::ZERO,
+        }
     }
 }

@@ -231,6 +231,7 @@ impl Pacer {
             guard_events: 0,
             recovery_count: 0,
             recoveries: Vec::new(),
+            cuts: session.tissue().cuts(),
             awake_points: 0,
             path_counts: [0; 3],
             stages: Vec::new(),

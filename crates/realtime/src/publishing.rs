@@ -140,6 +140,7 @@ impl SessionTask {
         if status.recovery_count != recovery_count {
             (status.recovery_count, status.recoveries) = (recovery_count, self.session.recoveries().list());
         }
+        status.cuts = self.session.tissue().cuts();
         status.awake_points = self.session.tissue().awake_points();
         if let Some(times) = self.session.tissue().stage_times() {
             status.stages = times.list();
@@ -174,7 +175,8 @@ impl SessionTask {
             Err(refusal) => return viewers.iter().for_each(|(viewer, _)| viewer.close(refusal.clone())),
         };
         let snapshot = Snapshot::new(&model.scene, self.session.step_count(), self.session.time_s(), displacement_m);
-        let snapshot = Arc::new(snapshot.with_skin(self.handle.skin.as_ref()));
+        let version = self.session.tissue().cuts().version();
+        let snapshot = Arc::new(snapshot.with_skin(self.handle.skin.as_ref()).of_topology(version));
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
         encoder.post(self.handle.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use super::clock::Dilation;
 use palpate_session::schedule::Schedule;
-use palpate_tissue::Model;
 use palpate_tissue::scene::record::{Recovery, StageTime};
+use palpate_tissue::{Cuts, Model};
 
 /// Whether a session's simulated time advances. A running session at rest or frozen is [`RunState::Running`] too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,6 +49,8 @@ pub struct Status {
     /// The newest recoveries, at most [`MAX_RECOVERIES`](palpate_session::recovery::MAX_RECOVERIES), by ascending
     /// step.
     pub recoveries: Vec<Recovery>,
+    /// What blades have severed.
+    pub cuts: Cuts,
     /// Number of points that a step computes now; 0 at rest.
     pub awake_points: usize,
     /// Counts of limited steps, dropped poses and releases: see [`palpate_session::Session::path_counts`].

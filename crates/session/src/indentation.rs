@@ -93,7 +93,7 @@ impl Indentation {
             * stiffness
             * match self.shape {
                 TipShape::Disc => 16.0 / (3.0 * std::f64::consts::PI.powi(2) * radius_m),
-                TipShape::RigidDisc => 0.5 / radius_m,
+                TipShape::RigidDisc | TipShape::Blade => 0.5 / radius_m,
                 TipShape::Sphere => 0.75 / (radius_m * row.depth_m).sqrt(),
             }
     }

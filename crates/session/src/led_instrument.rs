@@ -114,7 +114,7 @@ impl LedInstrument {
     ) -> Vec<Command> {
         let (pose, velocity) = self.led(pose, velocity);
         self.each(command, |number| {
-            let (place_m, tip) = (self.instrument.tip_m(number, &pose), self.instrument.tips[number].tip);
+            let (place_m, tip) = (self.instrument.tip_m(number, &pose), self.instrument.tip(number, &pose));
             let velocity_m_per_s =
                 velocity.map(|velocity| self.instrument.tip_velocity_m_per_s(number, &pose, &velocity));
             match is_led(shape, place_m, tip.radius_m) {

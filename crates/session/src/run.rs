@@ -12,7 +12,7 @@ use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
 use palpate_tissue::scene::profile::PoseProfile;
-use palpate_tissue::scene::record::{Line, Record, Run, Summary, far_warning, write_line};
+use palpate_tissue::scene::record::{Line, Record, Run, Summary, TopologyRecord, far_warning, write_line};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::{Model, StageTimes, Tissue};
 
@@ -206,6 +206,12 @@ fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'
     }
 }
 
+/// Returns how blades have changed what joins the points of a tissue.
+pub fn topology(tissue: &dyn Tissue) -> TopologyRecord {
+    let cuts = tissue.cuts();
+    TopologyRecord { topology_version: cuts.version(), severed: cuts.len(), pieces: cuts.pieces(tissue.model()) }
+}
+
 /// Returns the summary of a run that ended with this tissue and whose steps took `wall_s`, s: counts, time per point
 /// and substep (ns; not a number before the first substep), and the final hash. Fields that only the run itself can
 /// fill (audit, corrections, recoveries, warnings, peaks, curves and network) are empty or 0.
@@ -221,6 +227,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * model.len() as f64),
         computed_fraction: tissue.computed_fraction(),
         guard_events: tissue.guard_events(),
+        topology: Some(topology(tissue)),
         final_hash: format!("{:032x}", tissue.state_hash()),
         audited_error: None,
         mesh_error_estimate: None,

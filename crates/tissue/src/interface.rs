@@ -9,6 +9,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::audit_window::{Mark, WindowInputs};
 use crate::body::model::{Model, Plan};
+use crate::body::severed::Cuts;
 use crate::kernel::field::BLOCK;
 use crate::saved::SavedTissue;
 use crate::scene::profile::Poke;
@@ -226,6 +227,8 @@ pub trait Tissue: Send {
     /// Returns the number of substeps done since the tissue was created, skipped ones and those that the guard
     /// repeated included.
     fn substeps_done(&self) -> u64;
+    /// Returns what blades have severed.
+    fn cuts(&self) -> Cuts;
     /// Returns the number of points that a step computes now; the others are at rest. 0 if the whole tissue
     /// sleeps.
     fn awake_points(&self) -> usize;

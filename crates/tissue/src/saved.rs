@@ -148,6 +148,9 @@ pub struct TissueParts {
     pub(crate) checkpoint: Option<SavedCheckpoint>,
     pub(crate) inputs: Vec<(u64, u64, SavedInput)>,
     pub(crate) tiles: SavedTiles,
+    /// The severed springs, in the order in which they were severed, and the version of the topology.
+    pub(crate) severed: Vec<SavedSpring>,
+    pub(crate) topology_version: u32,
     pub(crate) guard_events: u64,
     pub(crate) substeps_done: u64,
     pub(crate) points_done: u64,
@@ -164,6 +167,18 @@ pub(crate) struct SavedCheckpoint {
     pub(crate) work: SavedWork,
     pub(crate) largest: f64,
     pub(crate) passed_checks: bool,
+    /// How many of the severed springs were severed then: the first of their list.
+    pub(crate) severed: u64,
+}
+
+/// A severed spring: the place in memory of its first end, its number there, the part of the way to the other end, and the
+/// version of the topology since which it is severed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedSpring {
+    pub(crate) place: u32,
+    pub(crate) number: u32,
+    pub(crate) part: f64,
+    pub(crate) version: u32,
 }
 
 /// The guard's account of work and energy.
@@ -255,6 +270,7 @@ pub(crate) struct SavedContact {
     pub(crate) place: SavedPlace,
     pub(crate) from_m: Vector,
     pub(crate) to_m: Vector,
+    pub(crate) from_edge_m: Vector,
     /// 0 free, 1 sticking, 2 sliding, 3 holding.
     pub(crate) contact_state: u8,
     pub(crate) normal: Vector,
@@ -359,10 +375,12 @@ pub(crate) enum SavedGrasp {
 pub struct SavedTip {
     radius_m: f64,
     friction: f64,
-    /// 0 a disc that touches, 1 one that grasps, 2 a rigid disc, 3 a sphere.
+    /// 0 a disc that touches, 1 one that grasps, 2 a rigid disc, 3 a sphere, 4 a blade.
     kind: u8,
     /// Stiffness, N/m, and damping, N·s/m, of a spring coupling; `None` for a constraint.
     spring: Option<(f64, f64)>,
+    /// The edge of a blade, m.
+    edge_m: Vector,
 }
 
 /// Checks the parts of a snapshot when it is restored, against a tissue and the limits. All its refusals name
@@ -606,20 +624,25 @@ pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Resu
 }
 
 /// The shapes of tips and whether they grasp, in the order of [`SavedTip::kind`].
-const TIP_KINDS: [(TipShape, bool); 4] =
-    [(TipShape::Disc, false), (TipShape::Disc, true), (TipShape::RigidDisc, false), (TipShape::Sphere, false)];
+const TIP_KINDS: [(TipShape, bool); 5] = [
+    (TipShape::Disc, false),
+    (TipShape::Disc, true),
+    (TipShape::RigidDisc, false),
+    (TipShape::Sphere, false),
+    (TipShape::Blade, false),
+];
 
 impl SavedTip {
     /// Converts a tip to plain data, without rounding.
     #[allow(clippy::cast_possible_truncation)]
     pub fn of(tip: &Tip) -> Self {
-        let Tip { shape, radius_m, friction, grasps, coupling } = *tip;
+        let Tip { shape, radius_m, friction, grasps, coupling, edge_m } = *tip;
         let spring = match coupling {
             Coupling::Constraint => None,
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Some((stiffness_n_per_m, damping_n_s_per_m)),
         };
         let kind = TIP_KINDS.iter().position(|kind| *kind == (shape, grasps)).unwrap_or(0) as u8;
-        SavedTip { radius_m, friction, kind, spring }
+        SavedTip { radius_m, friction, kind, spring, edge_m: edge_m.into() }
     }
 
     /// Checks a saved tip against a tissue and returns it.
@@ -628,14 +651,14 @@ impl SavedTip {
     /// Refuses a tip that a command may not have either ([`check_tip`]): a radius that is not above 0 or too large for
     /// the tissue, a friction outside 0 to 10, or a coupling out of range. The field is that of `snapshot.tip`.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
-        let SavedTip { radius_m, friction, kind, spring } = *self;
+        let SavedTip { radius_m, friction, kind, spring, edge_m } = *self;
         let (shape, grasps) =
             TIP_KINDS.get(usize::from(kind)).copied().ok_or_else(|| unsound("an unknown kind of tip"))?;
         let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        let tip = Tip { shape, radius_m, friction, grasps, coupling };
+        let tip = Tip { shape, radius_m, friction, grasps, coupling, edge_m: checks.vector(edge_m)? };
         check_tip("snapshot.tip", checks.shape, &tip)?;
         Ok(tip)
     }

@@ -270,9 +270,9 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
                     (Some(stiffness_n_per_m), damping_n_s_per_m)
                 }
             };
-            let Tip { shape, radius_m, friction, grasps, .. } = *tip;
-            let shape = shape as u32;
-            let tip = pb::Tip { radius_m, friction, grasps, spring_n_per_m, spring_n_s_per_m, shape };
+            let Tip { shape, radius_m, friction, grasps, edge_m, .. } = *tip;
+            let (shape, edge_m) = (shape as u32, vector(edge_m).filter(|_| edge_m != DVec3::ZERO));
+            let tip = pb::Tip { radius_m, friction, grasps, spring_n_per_m, spring_n_s_per_m, shape, edge_m };
             let is_same = tips.insert(command.tool, tip) == Some(tip);
             Message::Pose(pb::Pose {
                 place_m: vector(*place_m),
@@ -352,7 +352,14 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
             Action::Pose {
                 place_m: from_vector(pose.place_m.as_ref()),
                 velocity_m_per_s: pose.velocity_m_per_s.as_ref().map(|velocity| from_vector(Some(velocity))),
-                tip: Tip { shape, radius_m: tip.radius_m, friction: tip.friction, grasps: tip.grasps, coupling },
+                tip: Tip {
+                    shape,
+                    radius_m: tip.radius_m,
+                    friction: tip.friction,
+                    grasps: tip.grasps,
+                    coupling,
+                    edge_m: from_vector(tip.edge_m.as_ref()),
+                },
             }
         }
         Message::Release(_) => Action::Release,

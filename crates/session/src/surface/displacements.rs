@@ -17,6 +17,8 @@ pub struct Snapshot {
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
+    /// The version of the topology ([`Cuts::version`](palpate_tissue::Cuts::version)).
+    pub topology_version: u32,
     /// Displacements, m: x, y and z separate. Point [i, j] of a sheet is at i·ny + j; the vertices of a mesh are in
     /// the order of memory.
     displacement_m: [Vec<f32>; 3],
@@ -41,6 +43,7 @@ impl Snapshot {
         Snapshot {
             step,
             simulation_time_s,
+            topology_version: 0,
             displacement_m,
             skin: None,
             shown_m: OnceLock::new(),
@@ -56,6 +59,12 @@ impl Snapshot {
     #[must_use]
     pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
         Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
+    }
+
+    /// Returns this snapshot with the version of the topology.
+    #[must_use]
+    pub fn of_topology(self, topology_version: u32) -> Self {
+        Snapshot { topology_version, ..self }
     }
 
     /// Returns the displacements of the shown vertices, m.

@@ -55,6 +55,8 @@ pub struct Frame {
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
+    /// The version of the topology then.
+    pub topology_version: u32,
     /// Refinement of the surface.
     pub refinement: Refinement,
     /// Number format of the displacements.
@@ -133,7 +135,16 @@ impl Frame {
     /// Creates a frame with its patches laid out, but without bytes.
     fn blank(refinement: Refinement, encoding: Encoding) -> Self {
         let patches = lay_out([0, 0], refinement.vertices(), encoding);
-        Frame { step: 0, simulation_time_s: 0.0, refinement, encoding, quanta: Quanta::default(), full: true, patches }
+        Frame {
+            step: 0,
+            simulation_time_s: 0.0,
+            topology_version: 0,
+            refinement,
+            encoding,
+            quanta: Quanta::default(),
+            full: true,
+            patches,
+        }
     }
 }
 
@@ -191,7 +202,8 @@ pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
 }
 
 fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
-    let mut frame = Frame { step: snapshot.step, simulation_time_s: snapshot.simulation_time_s, ..spent };
+    let Snapshot { step, simulation_time_s, topology_version, .. } = *snapshot;
+    let mut frame = Frame { step, simulation_time_s, topology_version, ..spent };
     frame.quanta = Quanta::over(frame.encoding, snapshot.box_m(), 0.0);
     let grid = frame.refinement;
     let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points()));

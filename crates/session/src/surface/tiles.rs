@@ -238,6 +238,7 @@ impl FrameTiles {
         Frame {
             step: now.step,
             simulation_time_s: now.simulation_time_s,
+            topology_version: now.topology_version,
             refinement: *refinement,
             encoding: *encoding,
             quanta: *quanta,

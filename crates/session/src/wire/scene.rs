@@ -12,9 +12,9 @@ use super::required;
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
 use palpate_tissue::scene::sent::{self, MeshFile};
 use palpate_tissue::scene::{
-    Appearance, Body, Branch, Branches, CellSize, Change, FixedPart, FixedPoints, FixedVertices, Gravity, Inclusion,
-    Integrator, Lanes, Layer, Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated, Solid,
-    SolidMaterial, Springs, Stepping, Substance, Volume,
+    Appearance, Body, Branch, Branches, CellSize, Change, Cutting, FixedPart, FixedPoints, FixedVertices, Gravity,
+    Inclusion, Integrator, Lanes, Layer, Material, Mesh, Named, PointSet, Precision, Region, Scene, Sheet, Simulated,
+    Solid, SolidMaterial, Springs, Stepping, Substance, Volume,
 };
 use palpate_tissue::shape::RestShape;
 
@@ -64,6 +64,9 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         },
         sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
         appearance: Appearance::default(),
+        cutting: message.cutting.map_or_else(Cutting::default, |pb::Cutting { toughness_j_per_m2, thickness_m }| {
+            Cutting { toughness_j_per_m2, thickness_m }
+        }),
     })
 }
 
@@ -81,6 +84,7 @@ fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: springs.shear_stiffness_n_per_m.unwrap_or(stiffness_n_per_m),
             bending: springs.bending,
+            pretension_n_per_m: springs.pretension_n_per_m,
         },
         anchor_stiffness_n_per_m: required("anchor_springs.stiffness_n_per_m", anchor_springs.stiffness_n_per_m)?,
         damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
@@ -148,7 +152,11 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
     };
     let made = Mesh::simulating(simulated, point_mass_kg, fixed)?;
     let substance = match material {
-        Some(material) => Substance::of_material(material, bending, made.shape)?,
+        Some(material) => {
+            let made = Substance::of_material(material, bending, made.shape)?;
+            let pretension_n_per_m = springs.pretension_n_per_m;
+            Substance { springs: Springs { pretension_n_per_m, ..made.springs }, ..made }
+        }
         None if bending > 0.0 => from_coefficients(message, Body::Mesh(Mesh::new(point_mass_kg, bending, made.shape)))?,
         None => from_coefficients(message, Body::Mesh(made))?,
     };
@@ -433,6 +441,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             shear_stiffness_n_per_m: scene.sheet().map(|_| scene.springs.shear_stiffness_n_per_m),
             bending: scene.springs.bending,
             bending_factor: of_mesh.map(|mesh| mesh.bending),
+            pretension_n_per_m: scene.springs.pretension_n_per_m,
         }),
         anchor_springs: Some(pb::AnchorSprings { stiffness_n_per_m: Some(scene.anchor_stiffness_n_per_m) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(scene.damping_n_s_per_m) }),
@@ -447,6 +456,10 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             correct: scene.stepping.correct,
         }),
         sleep: scene.sleep_tolerance.map(|tolerance| pb::Sleep { tolerance: Some(tolerance) }),
+        cutting: (scene.cutting != Cutting::default()).then_some(pb::Cutting {
+            toughness_j_per_m2: scene.cutting.toughness_j_per_m2,
+            thickness_m: scene.cutting.thickness_m,
+        }),
     }
 }
 

@@ -10,14 +10,16 @@ pub(crate) struct Spring {
     pub(crate) ends: [usize; 2],
     pub(crate) rest_m: DVec3,
     pub(crate) stiffness_n_per_m: f64,
+    /// The part of it that a pretension has.
+    pub(crate) tension_n_per_m: f64,
     pub(crate) tangent: DMat3,
     /// Force on the first end, N.
     pub(crate) force_n: DVec3,
 }
 
 impl Spring {
-    pub(super) fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
-        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
+    pub(super) fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64, tension_n_per_m: f64) -> Self {
+        Spring { ends, rest_m, stiffness_n_per_m, tension_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
     }
 }
 
@@ -44,6 +46,16 @@ impl Elements {
         if let Elements::Springs(springs) = self { springs } else { &[] }
     }
 
+    /// Removes springs, given by their ends and rest vectors, m, ascending by their ends.
+    pub(crate) fn remove(&mut self, found: &[([usize; 2], DVec3)]) {
+        let Elements::Springs(springs) = self else { return };
+        springs.retain(|spring| {
+            let from = found.partition_point(|(ends, _)| *ends < spring.ends);
+            let same = found[from..].iter().take_while(|(ends, _)| *ends == spring.ends);
+            !same.into_iter().any(|(_, rest_m)| *rest_m == spring.rest_m)
+        });
+    }
+
     /// Computes forces and their derivatives at the present displacements of the points, m. Adds to `blocks` the
     /// stiffness that holds each point if the others are held.
     pub(crate) fn linearise(&mut self, displacement_m: &[DVec3], blocks: &mut [DMat3]) {
@@ -63,8 +75,10 @@ impl Elements {
             let along = apart_m / (s * rest_squared.sqrt());
             let outer = DMat3::from_cols(along * along.x, along * along.y, along * along.z);
             let across = stretch.max(0.0);
-            spring.force_n = spring.stiffness_n_per_m * stretch * apart_m;
-            spring.tangent = spring.stiffness_n_per_m * (outer * (1.0 - across) + DMat3::IDENTITY * across);
+            let slack_n_per_m = spring.stiffness_n_per_m - spring.tension_n_per_m;
+            let tension = DMat3::IDENTITY * spring.tension_n_per_m;
+            spring.force_n = slack_n_per_m * stretch * apart_m + spring.tension_n_per_m * delta;
+            spring.tangent = slack_n_per_m * (outer * (1.0 - across) + DMat3::IDENTITY * across) + tension;
             blocks[a] += spring.tangent;
             blocks[b] += spring.tangent;
         }

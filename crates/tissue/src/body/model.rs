@@ -29,6 +29,8 @@ pub struct Model {
     pub(crate) fixed: Vec<usize>,
     /// The unit of length: the distance between neighbours, m.
     pub(crate) unit_m: f64,
+    /// By which part of its length the pretension stretches each spring at rest; 0 without.
+    pub(crate) prestrain: f64,
     /// Where the points are in memory, and how they differ.
     pub(crate) places: Places,
     /// ω_b = √((λ + K″)/m), rad/s, for a point of the reference mass m; λ is the largest eigenvalue of the
@@ -156,6 +158,7 @@ impl Model {
             fixed,
             places,
             unit_m: scene.shape().edge_m(),
+            prestrain: scene.prestrain(),
             omega_bound_per_s: Oscillator::of(&scene).omega_bound_per_s(),
             plan,
             precision,

@@ -8,16 +8,19 @@ use crate::body::Places;
 use crate::body::advance::AdvanceStage;
 use crate::body::force_field::{self, Pull, Term};
 use crate::body::model::{Model, Plan};
+use crate::body::severed::{Cuts, Severed, SeveredSpring};
+use crate::body::sheet::cuts::SheetCuts;
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
 use crate::body::solid::{self, NeoHookean, PointLoad, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
+use crate::body::spring_ends::SHEET_ENDS;
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
 use crate::kernel::lanes::{self, SingleWork, Width};
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
-use crate::kernel::springs::{SpringCoefficients, Springs};
+use crate::kernel::springs::{ENDS, SpringCoefficients, Springs};
 use crate::kernel::stage::Stage;
 use crate::scheme::arithmetic::{Arithmetic, MAX_KEPT};
 
@@ -36,17 +39,34 @@ pub(crate) enum Elastic<T> {
 }
 
 impl<T: Real> Elastic<T> {
-    /// Returns the force of all springs, of the extra anchor stiffness and of the pressure on a point, divided
+    /// Returns the force of all whole springs, of the extra anchor stiffness and of the pressure on a point, divided
     /// by its relative mass. For a few single points. `volume_change` is the growth of the volume.
-    pub(crate) fn gather(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
-        lanes::single(&Gathering { springs: self, layout, u, volume_change, point })
+    pub(crate) fn gather(
+        &self,
+        severed: &Severed,
+        layout: &Layout,
+        u: &[T],
+        volume_change: f64,
+        point: [usize; 2],
+    ) -> [T; 3] {
+        lanes::single(&Gathering { springs: self, severed, layout, u, volume_change, point })
     }
 
     /// Returns what [`Elastic::gather`] does, within [`lanes::single`].
     #[inline(always)]
-    pub(crate) fn gather_inline(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
+    pub(crate) fn gather_inline(
+        &self,
+        severed: &Severed,
+        layout: &Layout,
+        u: &[T],
+        volume_change: f64,
+        point: [usize; 2],
+    ) -> [T; 3] {
         match self {
-            Elastic::Sheet(springs) => springs.gather(layout, u, point),
+            Elastic::Sheet(springs) => {
+                let first = SHEET_ENDS * (point[0] * layout.columns + point[1]);
+                springs.gather(layout, u, point, |number| severed.has(first + number))
+            }
             Elastic::Solid(places, law, load) => {
                 solid::gather(places, law, load, layout, u, point[0] * layout.columns + point[1])
             }
@@ -55,7 +75,8 @@ impl<T: Real> Elastic<T> {
                 let pressed = places.volume.as_ref().map(|volume| {
                     (push_of(*factor, volume_change), volume.over_mass(&places.slots, slot).to_array().map(T::of))
                 });
-                surface::gather(&places.slots, unit, *pull, pressed, u, slot)
+                let first = places.slots.first_half(slot);
+                surface::gather(&places.slots, unit, *pull, pressed, u, slot, |number| severed.has(first + number))
             }
         }
     }
@@ -64,6 +85,7 @@ impl<T: Real> Elastic<T> {
 /// The gathering of the force on one point.
 struct Gathering<'a, T> {
     springs: &'a Elastic<T>,
+    severed: &'a Severed,
     layout: &'a Layout,
     u: &'a [T],
     volume_change: f64,
@@ -75,7 +97,7 @@ impl<T: Real> SingleWork for Gathering<'_, T> {
 
     #[inline(always)]
     fn compute(&self) -> [T; 3] {
-        self.springs.gather_inline(self.layout, self.u, self.volume_change, self.point)
+        self.springs.gather_inline(self.severed, self.layout, self.u, self.volume_change, self.point)
     }
 }
 
@@ -83,7 +105,7 @@ impl<T: Real> SingleWork for Gathering<'_, T> {
 pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
     let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
     match &model.places {
-        Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
+        Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, model.prestrain, unit)),
         Places::Solid(places) => {
             let (stiffness, [shear, lame]) = (unit * model.scene.springs.stiffness_n_per_m, places.lame_over_youngs());
             let load = PointLoad::new(places, unit, unit * model.scene.point_mass_kg() / model.unit_m);
@@ -91,7 +113,7 @@ pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
         }
         Places::Surface(places) => Elastic::Mesh(
             places.clone(),
-            SpringCoefficients::new(unit * model.scene.springs.stiffness_n_per_m, 1.0),
+            SpringCoefficients::tense(unit * model.scene.springs.stiffness_n_per_m, 1.0, model.prestrain),
             T::of(unit * model.scene.anchor_stiffness_n_per_m),
             places.volume.as_ref().map_or(0.0, |volume| unit * model.scene.volume_stiffness_pa * volume.stretch_m),
         ),
@@ -115,6 +137,9 @@ pub(crate) struct SweepTables<T> {
     mesh: Option<MeshTables<T>>,
     /// `None` but for a solid.
     solid: Option<SolidTables<T>>,
+    /// The severed springs. They are part of the state; the tables follow them.
+    pub(crate) severed: Severed,
+    cuts: SheetCuts<T>,
     /// `None` without a volume.
     pub(crate) pressure: Option<Pressure<T>>,
     /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
@@ -145,6 +170,8 @@ impl<T: Real> SweepTables<T> {
                 snapshot: RefCell::new(Snapshot::of(&graph.slots)),
             }),
             solid: model.places.solid().map(|places| SolidTables::new(places, &layout)),
+            severed: Severed::default(),
+            cuts: SheetCuts::none(&layout),
             pressure: model.places.surface().and_then(|graph| Pressure::new(graph, &layout)),
             free,
             carry: RefCell::new(carry),
@@ -161,6 +188,8 @@ impl<T: Real> SweepTables<T> {
             springs: self.springs.clone(),
             mesh: None,
             solid: None,
+            severed: self.severed.clone(),
+            cuts: SheetCuts::none(&self.layout),
             pressure: None,
             free: None,
             carry: RefCell::new(Field::of_length(0)),
@@ -176,6 +205,46 @@ impl<T: Real> SweepTables<T> {
             return [solid.masses.as_ptr(), std::ptr::null()];
         }
         self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
+    }
+
+    /// Severs a spring. Returns whether it was whole.
+    pub(crate) fn sever(&mut self, model: &Model, spring: SeveredSpring) -> bool {
+        let is_new = self.severed.add(model, spring);
+        if is_new {
+            self.set_spring(model, &spring, true);
+        }
+        is_new
+    }
+
+    /// Makes the severed springs those of `cuts` ([`Severed::replace`]).
+    pub(crate) fn set_severed(&mut self, model: &Model, cuts: &Cuts) {
+        let [whole, severed] = self.severed.replace(model, cuts);
+        whole.iter().for_each(|spring| self.set_spring(model, spring, false));
+        severed.iter().for_each(|spring| self.set_spring(model, spring, true));
+    }
+
+    /// Writes to the tables whether a spring is severed, as the set of severed springs has it.
+    fn set_spring(&mut self, model: &Model, spring: &SeveredSpring, is_severed: bool) {
+        let [first, second] = spring.ends.map(|place| place as usize);
+        let number = spring.number as usize;
+        match (&model.places, &mut self.mesh) {
+            (Places::Sheet(_), _) => {
+                let by = ENDS[number / 4][number % 4];
+                self.cuts.set(&self.layout, model.point_of(first), by, is_severed);
+            }
+            (Places::Surface(places), Some(mesh)) => {
+                mesh.springs.set(&places.slots, first, number, is_severed);
+                let back = model.number_at_other_end(first, number);
+                mesh.springs.set(&places.slots, second, back, is_severed);
+                if model.prestrain > 0.0 {
+                    for slot in [first, second] {
+                        let end = model.first_end(slot);
+                        mesh.springs.set_load(&places.slots, slot, |number| self.severed.has(end + number));
+                    }
+                }
+            }
+            _ => {}
+        }
     }
 
     /// Returns the growth of the volume, in cubes of the unit of length, after the points of `tiles` have moved
@@ -271,7 +340,7 @@ impl<T: Real> SweepTables<T> {
             (Elastic::Sheet(springs), _) => {
                 let mut carry = self.carry.borrow_mut();
                 debug_assert!(carry.len() == 3 * layout.plane);
-                let grid = Grid { layout, springs, x, carry: carry.as_mut_ptr() };
+                let grid = Grid { layout, springs, cuts: &self.cuts, x, carry: carry.as_mut_ptr() };
                 // SAFETY: the caller's promise.
                 unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
             }

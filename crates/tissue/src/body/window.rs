@@ -223,7 +223,9 @@ fn of_grid(model: &Model, size: [usize; 2], free: &[bool]) -> Vec<Spring> {
                     }
                     #[allow(clippy::cast_precision_loss)]
                     let rest_m = model.unit_m * DVec3::new(di as f64, dj as f64, 0.0);
-                    found.push(Spring::new(ends, rest_m, stiffness_n_per_m));
+                    let is_tense = di.abs().max(dj.abs()) < 2;
+                    let tension_n_per_m = if is_tense { model.prestrain * stiffness_n_per_m } else { 0.0 };
+                    found.push(Spring::new(ends, rest_m, stiffness_n_per_m, tension_n_per_m));
                 }
             }
         }
@@ -238,7 +240,8 @@ fn of_mesh(model: &Model, slots: &[usize], free: &[bool]) -> Vec<Spring> {
             let Ok(other) = slots.binary_search(&other) else { continue };
             if free[one] || free[other] {
                 let stiffness_n_per_m = model.scene.springs.stiffness_n_per_m * stiffness;
-                found.push(Spring::new([one, other], model.unit_m * rest, stiffness_n_per_m));
+                let tension_n_per_m = model.prestrain * stiffness_n_per_m;
+                found.push(Spring::new([one, other], model.unit_m * rest, stiffness_n_per_m, tension_n_per_m));
             }
         }
     }

@@ -6,6 +6,15 @@
 //!
 //! force on a = k(1 − L0/L)(x_b − x_a) = k·q/(s(1 + s))·(D0 + Δ),  energy = ½k(L − L0)² = ½k·L0²·(q/(1 + s))².
 //!
+//! **Pretension.** With the strain ε at rest, the force is k·ε·L0 there, along D0, and something holds the rest shape against it: a
+//! constant load on each end. The length at which such a spring is slack is L0·(1 − ε), so that spring and load give
+//!
+//! force on a = k(1 − ε)(1 − L0/L)(D0 + Δ) + k·ε·Δ,
+//! energy = ½k(1 − ε)(L − L0)² + ½k·ε·Δ·Δ, if it is counted from rest.
+//!
+//! Both are 0 at rest, again without cancellation. Of a severed spring the load alone is left, −k·ε·D0 on a: it opens the cut. Its energy is
+//! −k·ε·D0·Δ. The stiffness along the spring is k, and across it at most that, as without pretension.
+//!
 //! For |q| ≤ 1/8 (strains up to 6 %), q/(s(1 + s)) is q times a polynomial that is exact to the last bits; beyond, it
 //! comes from 1/s ([`SpringCoefficients::far`]). The choice depends on that spring alone, so every vector width agrees.
 
@@ -32,12 +41,21 @@ pub(crate) struct SpringCoefficients<T> {
     near: T,
     /// 1/L0².
     per_length_squared: T,
+    /// k·ε, with the strain ε of the pretension; 0 without.
+    pub(crate) tension: T,
 }
 
 impl<T: Real> SpringCoefficients<T> {
     /// Computes the coefficients. `stiffness` is k times any factor; `length_squared` is L0², in spacings
     /// squared.
     pub(crate) fn new(stiffness: f64, length_squared: f64) -> Self {
+        Self::tense(stiffness, length_squared, 0.0)
+    }
+
+    /// Computes the coefficients of springs with a pretension: `prestrain` is their strain at rest.
+    pub(crate) fn tense(stiffness: f64, length_squared: f64, prestrain: f64) -> Self {
+        let tension = T::of(prestrain * stiffness);
+        let stiffness = (1.0 - prestrain) * stiffness;
         let mut power = stiffness;
         let series = T::SERIES.map(|coefficient| {
             power /= length_squared;
@@ -48,6 +66,7 @@ impl<T: Real> SpringCoefficients<T> {
             series,
             near: T::of(NEAR * length_squared),
             per_length_squared: T::of(length_squared.recip()),
+            tension,
         }
     }
 
@@ -165,21 +184,33 @@ pub(crate) struct Springs<T> {
 }
 
 impl<T: Real> Springs<T> {
-    /// Computes the coefficients; forces are in newtons × `scale` / spacing.
-    pub(crate) fn new(springs: &scene::Springs, scale: f64) -> Self {
-        let structural = springs.stiffness_n_per_m * scale;
+    /// Computes the coefficients; forces are in newtons × `scale` / spacing. `prestrain` is the strain of the pretension.
+    pub(crate) fn new(springs: &scene::Springs, prestrain: f64, scale: f64) -> Self {
+        let (structural, shear) = (springs.stiffness_n_per_m * scale, springs.shear_stiffness_n_per_m * scale);
         Springs {
-            structural: SpringCoefficients::new(structural, 1.0),
-            shear: SpringCoefficients::new(springs.shear_stiffness_n_per_m * scale, 2.0),
+            structural: SpringCoefficients::tense(structural, 1.0, prestrain),
+            shear: SpringCoefficients::tense(shear, 2.0, prestrain),
             bending: springs.bending.then(|| SpringCoefficients::new(structural, 4.0)),
         }
     }
 
-    /// Returns the force of all springs on the point [i, j]. For a few single points.
+    /// Returns whether the sheet has a pretension.
+    #[inline(always)]
+    pub(crate) fn is_tense(&self) -> bool {
+        self.structural.tension != T::default() || self.shear.tension != T::default()
+    }
+
+    /// Returns the force of all springs on the point [i, j], but for those that `is_severed`, by their number. For a few single points.
     // Loops over indices: iterators are not always inlined, and then run without the caller's instructions.
     #[allow(clippy::needless_range_loop)]
     #[inline(always)]
-    pub(crate) fn gather(&self, layout: &Layout, u: &[T], [i, j]: [usize; 2]) -> [T; 3] {
+    pub(crate) fn gather(
+        &self,
+        layout: &Layout,
+        u: &[T],
+        [i, j]: [usize; 2],
+        is_severed: impl Fn(usize) -> bool,
+    ) -> [T; 3] {
         let mut sum = [T::default(); 3];
         let own = i * layout.stride + j;
         let kinds = [Some(&self.structural), Some(&self.shear), self.bending.as_ref()];
@@ -194,6 +225,14 @@ impl<T: Real> Springs<T> {
                 }
                 #[allow(clippy::cast_precision_loss)]
                 let rest = [T::of(di as f64), T::of(dj as f64), T::default()];
+                let tension = spring.tension;
+                if is_severed(4 * kind + end) {
+                    // What held the rest shape against the spring stays.
+                    for c in 0..3 {
+                        sum[c] += T::default() - tension * rest[c];
+                    }
+                    continue;
+                }
                 let (other, mut delta) = (i1 * layout.stride + j1, [T::default(); 3]);
                 for c in 0..3 {
                     delta[c] = u[c * layout.plane + other] - u[c * layout.plane + own];
@@ -205,7 +244,7 @@ impl<T: Real> Springs<T> {
                 }
                 let weight = spring.weight(Scalar(squares)).0;
                 for c in 0..3 {
-                    sum[c] += weight.fused(delta[c], weight * rest[c]);
+                    sum[c] += (weight + tension).fused(delta[c], weight * rest[c]);
                 }
             }
         }
@@ -213,8 +252,9 @@ impl<T: Real> Springs<T> {
     }
 }
 
-/// Rows and columns to the other ends of structural, shear and bending springs.
-const ENDS: [[[isize; 2]; 4]; 3] =
+/// Rows and columns to the other ends of structural, shear and bending springs. Seen from the other end, entry n of a kind is
+/// entry 3 − n.
+pub(crate) const ENDS: [[[isize; 2]; 4]; 3] =
     [[[-1, 0], [0, -1], [0, 1], [1, 0]], [[-1, -1], [-1, 1], [1, -1], [1, 1]], [[-2, 0], [0, -2], [0, 2], [2, 0]]];
 
 #[cfg(test)]

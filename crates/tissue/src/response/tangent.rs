@@ -23,6 +23,7 @@ use crate::body::MemoryLayout;
 use crate::body::elements::Elements;
 use crate::body::footprint::{Footprint, WeightedNode};
 use crate::body::model::Model;
+use crate::body::severed::Cuts;
 use crate::body::window::Window;
 use crate::memory;
 
@@ -212,6 +213,23 @@ impl<'m> LinearPatch<'m> {
     /// shorter.
     pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
         Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
+    }
+
+    /// Takes the severed springs away, of a patch in the tissue's own directions.
+    pub(crate) fn without(mut self, cuts: &Cuts) -> Self {
+        let within = |place: u32| self.window.find(self.model, self.model.point_of(place as usize));
+        let found = cuts.springs().iter().filter_map(|spring| {
+            let [first, second] = spring.ends;
+            let rest = self.model.springs_at(first as usize).find(|of| of.number == spring.number as usize)?.rest;
+            Some(([within(first)?, within(second)?], self.model.unit_m * rest))
+        });
+        let mut found: Vec<([usize; 2], DVec3)> = found.collect();
+        found.sort_unstable_by_key(|(ends, _)| *ends);
+        if !found.is_empty() {
+            self.elements.remove(&found);
+            self.linearise();
+        }
+        self
     }
 
     /// Computes forces and tangents at the present displacements.

@@ -1,7 +1,7 @@
 //! Checks of tool actions, in scripts and in commands.
 
 use glam::DVec3;
-use palpate_haptics::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip, TipShape};
 
 use super::profile::Poke;
 use crate::limits::Limits;
@@ -76,6 +76,29 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
     Ok(())
 }
 
+/// Checks the edge of a blade; no other tip has one.
+fn check_edge(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
+    let edge = format!("{field}.edge_m");
+    if tip.shape != TipShape::Blade {
+        let text = "is for a \"blade\"; other tips have no edge";
+        return if tip.edge_m == DVec3::ZERO { Ok(()) } else { Err(Refusal::new(Reason::WrongKind, edge, text)) };
+    }
+    let most_m = shape.longest_side_m();
+    let range = format!("above 0 and at most {} m long, the tissue's longest side", legible(most_m));
+    number(&edge, tip.edge_m.length(), &range, |length_m| length_m > 0.0 && length_m <= most_m)?;
+    let refuse = |key: &str, text: &str| Err(Refusal::new(Reason::WrongKind, format!("{field}.{key}"), text));
+    if tip.grasps {
+        return refuse("grasps", "is for a tip that holds: a blade cuts");
+    }
+    if tip.coupling != Coupling::Constraint {
+        return refuse("spring", "is for a tip that touches: a blade cuts");
+    }
+    if !shape.takes_blades() {
+        return refuse("shape", "is a blade, but a solid can't be cut: use a sheet or a surface");
+    }
+    Ok(())
+}
+
 /// Least radius of a rigid tip, in edges of a cell.
 const MIN_RIGID_RADIUS: f64 = 0.25;
 
@@ -86,7 +109,7 @@ const MIN_RIGID_RADIUS: f64 = 0.25;
 /// longest side, and on a mesh at most 32 mean edge lengths; friction is from 0 to 10; a coupling spring has a
 /// stiffness from 1e-12 to 1e12 N/m and a damping from 0 to 1e12 N·s/m. `field` is the tip's key: the refusal
 /// gives `{field}.radius_m` and the like. A rigid shape is for solids, from a quarter of
-/// a cell on, without a grasp and without a spring.
+/// a cell on, without a grasp and without a spring. A blade has an edge and neither of these; a solid can't be cut.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let (most_m, what) = shape.most_tip_radius_m();
     let range = format!("above 0 and at most {}, {what}", legible(most_m));
@@ -108,6 +131,7 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
             return refuse("a tip on a spring is a \"disc\"");
         }
     }
+    check_edge(field, shape, tip)?;
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
         let field = format!("{field}.spring");
         physical(&format!("{field}.stiffness_n_per_m"), stiffness_n_per_m)?;

@@ -78,6 +78,11 @@ const MUCH_FASTER: f64 = 2.5;
 /// The bound of the stiffness of a mesh whose points are all alike, divided by k.
 const EVEN: f64 = 12.0;
 
+/// Returns the strain of springs that have the pretension where they resist it with `stiffness_n_per_m`; 0 without a pretension.
+pub(super) fn strain_of(springs: &Springs, stiffness_n_per_m: f64) -> f64 {
+    if springs.pretension_n_per_m == 0.0 { 0.0 } else { springs.pretension_n_per_m / stiffness_n_per_m }
+}
+
 /// A kind of tissue in the text of scenes, and in parts. The list of kinds in the module `scene` calls it.
 pub(super) trait KindOfBody: BodyKind + Sized {
     /// The name of the section of a scene that describes the points.
@@ -168,6 +173,11 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
     /// Returns the volume that the tissue encloses, if its pressure counts.
     fn volume(&self) -> Option<&Volume> {
         None
+    }
+
+    /// Returns by which part of its length the pretension stretches each spring at rest; 0 without. The same for all springs.
+    fn prestrain(&self, _springs: &Springs) -> f64 {
+        0.0
     }
 
     /// Returns an upper bound of the largest eigenvalue of the springs' stiffness matrix under any deformation, with

@@ -18,7 +18,7 @@ use super::volume::{Swelling, Volume};
 use crate::limits::Limits;
 use crate::memory;
 use crate::scene::action_check::physical;
-use crate::scene::body::{BodyKind, KindOfBody, StiffnessBound};
+use crate::scene::body::{BodyKind, KindOfBody, StiffnessBound, strain_of};
 use crate::scene::graph::{MeshGraph, MeshSpring};
 use crate::scene::profile::Poke;
 use crate::scene::stepping::Integrator;
@@ -394,7 +394,8 @@ impl KindOfBody for Mesh {
         if let Some(item) = fields.item("bending") {
             *self = Mesh::new(self.point_mass_kg, read_bending(&item)?, self.shape.clone());
         }
-        Ok(Springs::alike(stiffness_n_per_m))
+        let pretension_n_per_m = fields.number("pretension_n_per_m")?.unwrap_or(0.0);
+        Ok(Springs { pretension_n_per_m, ..Springs::alike(stiffness_n_per_m) })
     }
 
     fn part(&self, side: usize) -> (Self, [PointId; 3]) {
@@ -405,6 +406,20 @@ impl KindOfBody for Mesh {
 impl BodyKind for Mesh {
     fn section(&self) -> &'static str {
         Self::SECTION
+    }
+
+    /// Returns 2·A·T₀/Σ k·L²: the mean of a tension that is the same in all directions of a surface of area A follows from the virial
+    /// of its springs, 2·A·T₀ = Σ F·L with F = k·L·ε.
+    fn prestrain(&self, springs: &Springs) -> f64 {
+        if springs.pretension_n_per_m == 0.0 {
+            return 0.0;
+        }
+        let MeshShape { vertices_m, triangles, .. } = &*self.shape;
+        let place_m = |vertex: u32| vertices_m[vertex as usize];
+        let doubled_m2 = |[a, b, c]: &[u32; 3]| (place_m(*b) - place_m(*a)).cross(place_m(*c) - place_m(*a)).length();
+        let doubled_m2: f64 = triangles.iter().map(doubled_m2).sum();
+        let virial: f64 = self.springs().map(|([a, b], k)| k * place_m(a).distance_squared(place_m(b))).sum();
+        strain_of(springs, springs.stiffness_n_per_m * virial / doubled_m2)
     }
 
     fn points_key(&self) -> &'static str {

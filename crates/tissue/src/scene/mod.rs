@@ -5,6 +5,7 @@ pub mod action;
 pub mod action_check;
 mod body;
 pub mod collection;
+mod cutting;
 mod eigenvalue;
 pub mod graph;
 pub mod kind;
@@ -37,6 +38,7 @@ use crate::shape::{PointId, RestShape};
 use action_check::physical;
 use body::KindOfBody;
 pub use body::{BodyKind, MAX_BRANCHES, MaxwellBranch, StiffnessBound};
+pub use cutting::Cutting;
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 use mesh::read_bending;
@@ -47,7 +49,7 @@ pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_
 pub use shown::{Shown, Simulated};
 pub use solid::{Branch, Branches, CellSize, FixedPart, Gravity, Layer, Solid, SolidMaterial, SolidShape};
 use source::Files;
-pub use springs::Springs;
+pub use springs::{MAX_PRESTRAIN, Springs};
 pub use stepping::{Integrator, Lanes, Precision, Stepping};
 use toml_document::{Document, Fields, Item};
 pub use volume::{Swelling, Volume};
@@ -124,6 +126,8 @@ pub struct Scene {
     pub sleep_tolerance: Option<f64>,
     /// How viewers draw the tissue; without effect on its motion.
     pub appearance: Appearance,
+    /// How the tissue resists a blade.
+    pub cutting: Cutting,
 }
 
 /// Writes [`Body`] and what it asks of each kind, from one list: a kind of tissue is a line there.
@@ -385,6 +389,7 @@ impl Scene {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
                     None => None,
                 },
+                cutting: fields.item("cutting").map_or(Ok(Cutting::default()), |item| Cutting::read(&item))?,
                 appearance: fields
                     .item("appearance")
                     .map_or(Ok(Appearance::default()), |item| read_appearance(&item, limits))?,
@@ -415,6 +420,26 @@ impl Scene {
         scene.anchor_stiffness_n_per_m = change.anchor_stiffness_n_per_m.unwrap_or(scene.anchor_stiffness_n_per_m);
         scene.volume_stiffness_pa = change.volume_stiffness_pa.unwrap_or(scene.volume_stiffness_pa);
         scene
+    }
+
+    /// Returns by which part of its length the pretension stretches each spring at rest; 0 without.
+    pub fn prestrain(&self) -> f64 {
+        self.body.kind().prestrain(&self.springs)
+    }
+
+    fn check_pretension(&self) -> Result<()> {
+        let prestrain = self.prestrain();
+        // NaN is not below it.
+        if prestrain <= MAX_PRESTRAIN {
+            return Ok(());
+        }
+        let (most, field) = (MAX_PRESTRAIN * self.springs.pretension_n_per_m / prestrain, "springs.pretension_n_per_m");
+        let message = format!(
+            "would stretch each spring by {:.0} % at rest: springs of this stiffness bear at most {:.3} N/m",
+            100.0 * prestrain,
+            if most.is_finite() { most } else { 0.0 }
+        );
+        Err(Refusal::new(Reason::OutOfRange, field, message))
     }
 
     /// Returns the rest shape of the tissue, borrowed: its sheet or mesh.
@@ -500,6 +525,7 @@ impl Scene {
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
             ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
+            ("springs.pretension_n_per_m", self.springs.pretension_n_per_m),
             ("anchor_springs.stiffness_n_per_m", self.anchor_stiffness_n_per_m),
             ("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
             ("volume.stiffness_pa", self.volume_stiffness_pa),
@@ -512,6 +538,8 @@ impl Scene {
         if self.volume_stiffness_pa > 0.0 && self.volume().is_none() {
             return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
         }
+        self.check_pretension()?;
+        self.cutting.check()?;
         self.check_integrator()?;
         self.stepping.check(limits)?;
         if let Some(tolerance) = self.sleep_tolerance {
@@ -712,17 +740,19 @@ fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Resul
     if let Some(other) = anchor_springs.or(damping) {
         return Err(other.refuse(Reason::WrongKind, Material::FOLLOWS));
     }
-    let bending = match fields.item("springs") {
-        None => 0.0,
+    let (bending, pretension_n_per_m) = match fields.item("springs") {
+        None => (0.0, 0.0),
         Some(springs) => springs.table(|fields| {
             let (stiffness, shear) = (fields.item("stiffness_n_per_m"), fields.item("shear_stiffness_n_per_m"));
             if let Some(item) = stiffness.or(shear) {
                 return Err(item.refuse(Reason::WrongKind, Material::FOLLOWS));
             }
-            fields.item("bending").map_or(Ok(0.0), |item| read_bending(&item))
+            let bending = fields.item("bending").map_or(Ok(0.0), |item| read_bending(&item))?;
+            Ok((bending, fields.number("pretension_n_per_m")?.unwrap_or(0.0)))
         })?,
     };
-    Substance::of_material(material, bending, mesh.shape.clone())
+    let substance = Substance::of_material(material, bending, mesh.shape.clone())?;
+    Ok(Substance { springs: Springs { pretension_n_per_m, ..substance.springs }, ..substance })
 }
 
 fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {

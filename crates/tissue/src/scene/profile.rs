@@ -252,6 +252,14 @@ pub struct InstrumentProfile {
     pub first_tool: usize,
 }
 
+impl PoseProfile {
+    /// Returns the tip at a time at which it is there; the edge of a blade turns with its instrument.
+    pub fn tip_at(&self, time_s: f64) -> Tip {
+        let pose = self.mounted.as_ref().and_then(|(instrument, tip)| Some((instrument, *tip, instrument.at(time_s)?)));
+        pose.map_or(self.tip, |(instrument, tip, pose)| instrument.instrument.tip(tip, &pose))
+    }
+}
+
 impl InstrumentProfile {
     /// Returns the pose at a time; `None` before the first pose and from `until_s` on.
     pub fn at(&self, time_s: f64) -> Option<InstrumentPose> {

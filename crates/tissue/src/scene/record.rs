@@ -199,6 +199,9 @@ pub struct Summary {
     /// How many times the guard went back and repeated with a shorter substep, or brought a solid that rested
     /// inside out to its shape.
     pub guard_events: u64,
+    /// How blades have changed what joins the points; `None`, and not written, for a replay.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub topology: Option<TopologyRecord>,
     /// XXH3-128 hash of the final state (`Tissue::state_hash`), 32 hexadecimal
     /// digits.
     pub final_hash: String,
@@ -235,6 +238,17 @@ pub struct Summary {
     /// The additional measurements of a replay; `None` for a run.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
+}
+
+/// How blades have changed what joins the points of a tissue, at the end of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct TopologyRecord {
+    /// Version of the topology: 0 if nothing was severed ([`Cuts::version`](crate::Cuts::version)).
+    pub topology_version: u32,
+    /// Number of severed springs.
+    pub severed: usize,
+    /// Number of parts of the tissue; 1 for one that is whole.
+    pub pieces: usize,
 }
 
 /// The time that a stage of the steps has taken.

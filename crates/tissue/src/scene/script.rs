@@ -14,7 +14,8 @@ use palpate_haptics::{ContactLoad, InstrumentContact, InstrumentPose, PortLoad};
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
 /// ([`made_for`](super::script_reader::made_for)).
-pub const BUILT_IN: [(&str, &str); 8] = [
+pub const BUILT_IN: [(&str, &str); 9] = [
+    ("cut", include_str!("../../../../scripts/cut.toml")),
     ("grasp", include_str!("../../../../scripts/grasp.toml")),
     ("lift", include_str!("../../../../scripts/lift.toml")),
     ("oblique-100", include_str!("../../../../scripts/oblique-100.toml")),
@@ -108,7 +109,10 @@ impl Script {
         };
         self.poses.iter().enumerate().filter_map(move |(index, profile)| {
             let action = match place_m(profile, step + 1) {
-                Some(place_m) => Action::Pose { place_m, velocity_m_per_s: None, tip: profile.tip },
+                Some(place_m) => {
+                    let tip = profile.tip_at((step + 1) as f64 / self.rate_hz);
+                    Action::Pose { place_m, velocity_m_per_s: None, tip }
+                }
                 None => place_m(profile, step).map(|_| Action::Release)?,
             };
             Some((first + index, action))

@@ -108,14 +108,19 @@ impl Binding<'_> {
             }
         }
         let (mut moves, mut poses) = (Vec::new(), Vec::new());
+        let mut blades = Vec::new();
         for item in items(fields, "tool")? {
+            if item.has("blade") {
+                blades.push(item);
+                continue;
+            }
             match self.tool(&item)? {
                 ToolTable::Moves(profile) => moves.push(profile),
                 ToolTable::Poses(profile) => poses.push(profile),
             }
         }
         let mut instruments = Vec::new();
-        for item in items(fields, "instrument")? {
+        for item in blades.into_iter().chain(items(fields, "instrument")?) {
             let first_tool = forces.len() + moves.len() + poses.len();
             let profile = Arc::new(self.instrument(&item, first_tool)?);
             poses.extend((0..profile.instrument.tips.len()).map(|tip| mounted(&profile, tip)));
@@ -536,10 +541,17 @@ impl Binding<'_> {
             check_tip(fields.own_path(), shape, &tip).map(|()| tip)
         };
         let mut instrument = Instrument::default();
+        if let Some(blade) = fields.item("blade") {
+            instrument = Instrument::of_tip(blade_of(&blade, shape)?);
+        }
         for tip in fields.item("tips").map_or(Ok(Vec::new()), |tips| tips.list())? {
             instrument.tips.push(tip.table(|fields| {
                 let offset_m = fields.item("offset_m").map_or(Ok(DVec3::ZERO), |item| item.vector())?;
-                Ok(InstrumentTip { offset_m, tip: read(fields)?, part: InstrumentPart::Body })
+                let tip = match fields.item("blade") {
+                    Some(blade) => blade_of(&blade, shape)?,
+                    None => read(fields)?,
+                };
+                Ok(InstrumentTip { offset_m, tip, part: InstrumentPart::Body })
             })?);
         }
         let mut part = |key: &'static str| {
@@ -553,7 +565,7 @@ impl Binding<'_> {
         let (jaws, shaft) = (part("jaws")?, part("shaft")?);
         instrument.add_parts(jaws, shaft);
         if instrument.tips.is_empty() {
-            return Err(item.refuse(Reason::Missing, "must have `tips`, a `shaft` or `jaws`"));
+            return Err(item.refuse(Reason::Missing, "must have `tips`, a `shaft`, `jaws` or a `blade`"));
         }
         if instrument.tips.len() > MAX_TIPS {
             let message = format!(
@@ -654,6 +666,19 @@ fn until(fields: &mut Fields<'_>, list: &Item<'_>, begin_s: Option<f64>) -> Resu
     Ok(until_s)
 }
 
+/// Radius of the part of the surface that a blade feels, m, if a script gives none.
+const BLADE_RADIUS_M: f64 = 0.001;
+
+/// Reads a blade. Its edge runs from the tip along the instrument's −x.
+fn blade_of(item: &Item<'_>, shape: &dyn shape::RestShape) -> Result<Tip> {
+    item.table(|fields| {
+        let length_m = positive(&fields.path("length_m"), fields.required_number("length_m")?)?;
+        let radius_m = fields.number("radius_m")?.unwrap_or(BLADE_RADIUS_M);
+        let tip = Tip { shape: TipShape::Blade, radius_m, edge_m: -length_m * DVec3::X, ..Tip::default() };
+        check_tip(fields.own_path(), shape, &tip).map(|()| tip)
+    })
+}
+
 fn read_tip(fields: &mut Fields<'_>) -> Result<Tip> {
     tip_of(fields, Tip::default())
 }
@@ -677,6 +702,7 @@ fn tip_of(fields: &mut Fields<'_>, standard: Tip) -> Result<Tip> {
         friction: fields.number("friction")?.unwrap_or(standard.friction),
         grasps: fields.item("grasps").map_or(Ok(standard.grasps), |item| item.flag())?,
         coupling,
+        edge_m: standard.edge_m,
     })
 }
 

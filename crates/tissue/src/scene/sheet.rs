@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3};
 use crate::limits::Limits;
 use crate::memory;
 use crate::scene::action_check::physical;
-use crate::scene::body::{BodyKind, KindOfBody};
+use crate::scene::body::{BodyKind, KindOfBody, strain_of};
 use crate::scene::source::Files;
 use crate::scene::springs::Springs;
 use crate::scene::stepping::Integrator;
@@ -144,6 +144,7 @@ impl KindOfBody for Sheet {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: shear.map_or(Ok(stiffness_n_per_m), |item| item.number())?,
             bending: bending.map_or(Ok(false), |item| item.flag())?,
+            pretension_n_per_m: fields.number("pretension_n_per_m")?.unwrap_or(0.0),
         })
     }
 
@@ -197,6 +198,13 @@ impl KindOfBody for Sheet {
 impl BodyKind for Sheet {
     fn section(&self) -> &'static str {
         Self::SECTION
+    }
+
+    /// Returns T₀/(k + 2k_s): of the springs that cross a line between two rows, the structural one of each point carries k·h·ε, and its
+    /// two shear springs k_s·√2·h·ε each, half of which is across the line.
+    fn prestrain(&self, springs: &Springs) -> f64 {
+        let stiffness_n_per_m = springs.stiffness_n_per_m + 2.0 * springs.shear_stiffness_n_per_m;
+        strain_of(springs, stiffness_n_per_m)
     }
 
     fn points_key(&self) -> &'static str {

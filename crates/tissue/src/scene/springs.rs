@@ -10,11 +10,21 @@ pub struct Springs {
     /// Whether a sheet has bending springs (2,0) and (0,2), with the structural k. (On a mesh, see
     /// [`Mesh::bending`](super::Mesh::bending).)
     pub bending: bool,
+    /// Tension T₀ of the tissue at rest, N for each metre across: a cut gapes by it. The same in all directions; 0 or more.
+    pub pretension_n_per_m: f64,
 }
+
+/// The largest part of its length by which the pretension may stretch a spring.
+pub const MAX_PRESTRAIN: f64 = 0.5;
 
 impl Springs {
     /// Returns springs that all have the same k, N/m, without bending springs.
     pub fn alike(stiffness_n_per_m: f64) -> Self {
-        Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false }
+        Springs {
+            stiffness_n_per_m,
+            shear_stiffness_n_per_m: stiffness_n_per_m,
+            bending: false,
+            pretension_n_per_m: 0.0,
+        }
     }
 }

@@ -524,6 +524,11 @@ impl<'a> Item<'a> {
         }
     }
 
+    /// Returns whether the value is a table with this key.
+    pub fn has(&self, key: &str) -> bool {
+        matches!(&self.node.value, Value::Table(entries) if entries.contains_key(key))
+    }
+
     /// Reads the value as a table by `read`, which asks for its keys, and returns the result of `read`.
     ///
     /// # Errors

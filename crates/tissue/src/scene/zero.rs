@@ -11,7 +11,7 @@ use palpate_haptics::{Coupling, Tip};
 
 use super::profile::Poke;
 use super::script::Action;
-use super::{Scene, Springs};
+use super::{Cutting, Scene, Springs};
 use palpate_refusal::unsigned_zero;
 
 fn unsigned(v: DVec3) -> DVec3 {
@@ -29,13 +29,14 @@ impl Scene {
             body,
             material,
             inclusions,
-            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, bending },
+            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, bending, pretension_n_per_m },
             anchor_stiffness_n_per_m,
             damping_n_s_per_m,
             volume_stiffness_pa,
             stepping,
             sleep_tolerance,
             appearance,
+            cutting: Cutting { toughness_j_per_m2, thickness_m },
         } = self;
         Scene {
             name,
@@ -46,6 +47,7 @@ impl Scene {
                 stiffness_n_per_m: unsigned_zero(stiffness_n_per_m),
                 shear_stiffness_n_per_m: unsigned_zero(shear_stiffness_n_per_m),
                 bending,
+                pretension_n_per_m: unsigned_zero(pretension_n_per_m),
             },
             anchor_stiffness_n_per_m: unsigned_zero(anchor_stiffness_n_per_m),
             damping_n_s_per_m: unsigned_zero(damping_n_s_per_m),
@@ -53,6 +55,10 @@ impl Scene {
             stepping,
             sleep_tolerance: sleep_tolerance.map(unsigned_zero),
             appearance,
+            cutting: Cutting {
+                toughness_j_per_m2: unsigned_zero(toughness_j_per_m2),
+                thickness_m: thickness_m.map(unsigned_zero),
+            },
         }
     }
 }
@@ -72,16 +78,16 @@ impl Action {
             Action::Grasp { point, displacement_m } => {
                 Action::Grasp { point, displacement_m: unsigned(displacement_m) }
             }
-            Action::Pose { place_m, velocity_m_per_s, tip: Tip { shape, radius_m, friction, grasps, coupling } } => {
-                let coupling = match coupling {
+            Action::Pose { place_m, velocity_m_per_s, tip } => {
+                let coupling = match tip.coupling {
                     Coupling::Constraint => Coupling::Constraint,
                     Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Coupling::Spring {
                         stiffness_n_per_m: unsigned_zero(stiffness_n_per_m),
                         damping_n_s_per_m: unsigned_zero(damping_n_s_per_m),
                     },
                 };
-                let (radius_m, friction) = (unsigned_zero(radius_m), unsigned_zero(friction));
-                let tip = Tip { shape, radius_m, friction, grasps, coupling };
+                let (radius_m, friction) = (unsigned_zero(tip.radius_m), unsigned_zero(tip.friction));
+                let tip = Tip { radius_m, friction, coupling, edge_m: unsigned(tip.edge_m), ..tip };
                 let velocity_m_per_s = velocity_m_per_s.map(unsigned);
                 Action::Pose { place_m: unsigned(place_m), velocity_m_per_s, tip }
             }

@@ -147,7 +147,7 @@ mod tests {
     }
 
     fn springs(k: f64, shear: f64, bending: bool) -> Springs {
-        Springs { stiffness_n_per_m: k, shear_stiffness_n_per_m: shear, bending }
+        Springs { stiffness_n_per_m: k, shear_stiffness_n_per_m: shear, bending, pretension_n_per_m: 0.0 }
     }
 
     #[test]

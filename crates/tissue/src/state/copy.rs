@@ -62,6 +62,7 @@ impl<T: Real> TissueState<T> {
             points_done: self.points_done,
             known_volume_change: Cell::new(Some(self.volume_change())),
             stage_times: None,
+            spring_search: None,
         }))
     }
 
@@ -82,6 +83,7 @@ impl<T: Real> TissueState<T> {
             checkpoint: self.checkpoint.clone(),
             inputs: self.inputs.clone(),
             tiles: tiles.taken(),
+            cuts: tables.severed.cuts().clone(),
             guard_events: self.guard_events,
             substeps_done: self.substeps_done,
             points_done: self.points_done,
@@ -97,6 +99,7 @@ impl<T: Real> TissueState<T> {
         sheet.prescribed.clone_from(&checkpoint.prescribed);
         sheet.contacts.clone_from(&checkpoint.contacts);
         sheet.tiles.largest = checkpoint.largest;
+        sheet.tables.set_severed(model, &checkpoint.cuts);
         sheet
     }
 
@@ -123,6 +126,7 @@ impl<T: Real> TissueState<T> {
         sheet.applied = Applied::like(&self.applied);
         sheet.prescribed.clone_from(&self.prescribed);
         sheet.contacts.clone_from(&self.contacts);
+        sheet.tables.set_severed(model, self.tables.severed.cuts());
         sheet
     }
 

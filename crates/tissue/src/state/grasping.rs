@@ -34,7 +34,8 @@ impl<T: Real> StepContext<'_, T> {
         let StepContext { model, plan, tables, state, applied, tiles, .. } = self;
         let (point, scene) = (model.point_of(index), &model.scene);
         let volume_change = tables.volume_change(&state.u, tiles.region.tiles());
-        let springs = tables.springs.gather(&tables.layout, &state.u, volume_change, point).map(Real::wide);
+        let springs =
+            tables.springs.gather(&tables.severed, &tables.layout, &state.u, volume_change, point).map(Real::wide);
         let scale = plan.force_scale(scene);
         let applied_n = applied.from(model, index, moment);
         let (used, mass) = (applied.force_at(&tables.layout, 0, point), model.relative_mass_at(index));

@@ -45,6 +45,7 @@ use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::Prescribed;
+use palpate_haptics::TipShape;
 
 impl<T: Real> TissueState<T> {
     /// Does a step and checks it; if a check fails, repeats from the checkpoint with a shorter substep. Returns whether
@@ -137,7 +138,19 @@ impl<T: Real> TissueState<T> {
             let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
             let (work, largest) = (WorkAccount::default(), 0.0);
             let (steps, halvings, passed_checks) = (0, 0, true);
-            Arc::new(Checkpoint { steps, halvings, state, applied, prescribed, contacts, work, largest, passed_checks })
+            let cuts = tables.severed.cuts().clone();
+            Arc::new(Checkpoint {
+                steps,
+                halvings,
+                state,
+                applied,
+                prescribed,
+                contacts,
+                work,
+                largest,
+                passed_checks,
+                cuts,
+            })
         });
         let Some(checkpoint) = Arc::get_mut(checkpoint) else { return };
         checkpoint.largest = tiles.largest;
@@ -148,6 +161,7 @@ impl<T: Real> TissueState<T> {
         checkpoint.prescribed.clone_from(&self.prescribed);
         checkpoint.contacts.clone_from(&self.contacts);
         checkpoint.work = self.work;
+        checkpoint.cuts.clone_from(self.tables.severed.cuts());
         self.inputs.clear();
         self.mark();
     }
@@ -175,6 +189,7 @@ impl<T: Real> TissueState<T> {
         self.prescribed.clone_from(&checkpoint.prescribed);
         self.contacts.clone_from(&checkpoint.contacts);
         self.work = checkpoint.work;
+        self.tables.set_severed(&self.model, &checkpoint.cuts);
         let was = checkpoint.halvings;
         self.halve(was, halvings);
         self.tables.is_settled(0.0);
@@ -186,7 +201,14 @@ impl<T: Real> TissueState<T> {
         let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
         let springs = springs_of(&self.model, &was);
         let volume_change = self.volume_change();
-        convert(&self.tables.layout, &springs, [&was, &plan], &self.applied, volume_change, &mut self.state);
+        convert(
+            &self.tables.layout,
+            (&springs, &self.tables.severed),
+            [&was, &plan],
+            &self.applied,
+            volume_change,
+            &mut self.state,
+        );
         self.known_volume_change.set(None);
         self.applied.forget();
         self.tables.springs = springs_of(&self.model, &plan);
@@ -213,6 +235,9 @@ impl<T: Real> TissueState<T> {
                 self.prescribed.release(tool);
                 self.applied.set(tool, None);
                 self.contacts.pose(&self.model, tool, place_m, tip);
+                if tip.shape == TipShape::Blade {
+                    self.prepare_to_cut();
+                }
             }
             ToolInput::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
@@ -421,7 +446,14 @@ impl<T: Real> TissueState<T> {
         self.applied.terms = self.present_terms();
         let springs = springs_of(&self.model, &was);
         let volume_change = self.volume_change();
-        convert(&self.tables.layout, &springs, [&was, &plan], &self.applied, volume_change, &mut self.state);
+        convert(
+            &self.tables.layout,
+            (&springs, &self.tables.severed),
+            [&was, &plan],
+            &self.applied,
+            volume_change,
+            &mut self.state,
+        );
         self.known_volume_change.set(None);
         self.applied.forget();
         self.model = model.clone();

@@ -2,6 +2,7 @@
 //! restored.
 
 mod copy;
+pub(crate) mod cutting;
 mod grasping;
 pub mod guard;
 mod guarded;

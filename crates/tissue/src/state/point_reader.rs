@@ -103,8 +103,13 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
     fn compute(&self) -> [DVec3; 3] {
         let Observation { reader, index, applied_n } = *self;
         let PointReader { model, plan, tables, state, .. } = *reader;
-        let springs =
-            tables.springs.gather_inline(&tables.layout, &state.u, reader.volume_change, model.point_of(index));
+        let springs = tables.springs.gather_inline(
+            &tables.severed,
+            &tables.layout,
+            &state.u,
+            reader.volume_change,
+            model.point_of(index),
+        );
         let [i, j] = model.point_of(index);
         let mass = model.relative_mass_at(index);
         let still = reader.steps == 0 || !reader.tiles.region.is_awake(i, j);

@@ -12,7 +12,7 @@ use crate::kernel::real::Real;
 use crate::state::step_context::StepContext;
 use crate::tools::contact::{ContactForce, Contacts, Tool, ToolContact, movement_m, push, within_cone};
 use crate::tools::rigid_tip::RigidTip;
-use palpate_haptics::Coupling;
+use palpate_haptics::{Coupling, TipShape};
 
 impl Contacts {
     /// Makes position-controlled tools act at the end of a substep, which ends at `fraction` of the step. A
@@ -37,7 +37,10 @@ impl Contacts {
             if leg.jump_n != DVec3::ZERO {
                 push(model, plan, layout, state, &tool.footprint, leg.jump_n, plan.scheme.kick());
             }
-            let thrust = tool.solve_contact(model, plan, layout, state, leg);
+            let thrust = match tool.tip.shape {
+                TipShape::Blade => tool.resist(model, plan, layout, state, fraction),
+                _ => tool.solve_contact(model, plan, layout, state, leg),
+            };
             tool.is_new = false;
             tool.force_n = thrust.force_n();
             tool.steady_n = if met { thrust.goes_on_n } else { DVec3::ZERO };
@@ -58,7 +61,7 @@ impl Contacts {
             tiles.wake_under(tool.points());
             let change_n = thrust.steady_n - before_n;
             let is_put = is_new && !met;
-            let is_put_at_once = is_put && tool.tip.coupling == Coupling::Constraint;
+            let is_put_at_once = is_put && tool.coupling() == Coupling::Constraint;
             // The volume changes too little to compute it twice.
             let volume_change = if is_put_at_once { tables.volume_change(&state.u, tiles.region.tiles()) } else { 0.0 };
             let before = is_put_at_once.then(|| states(model, plan, tables, state, volume_change, tool));
@@ -184,7 +187,7 @@ impl Tool {
     /// Returns the motion of the tool and the force on it. `without_inertia` gives the force under which the disc is
     /// not accelerated, N.
     pub(crate) fn contact(&self, surface_m: DVec3, without_inertia: impl FnOnce() -> DVec3) -> ToolContact {
-        let felt_n = match (self.contact_state, self.tip.coupling) {
+        let felt_n = match (self.contact_state, self.coupling()) {
             (ContactState::Free, _) => DVec3::ZERO,
             _ if self.rigid.is_some() => -self.force_n,
             (_, Coupling::Spring { .. }) => -self.force_n,
@@ -251,7 +254,8 @@ fn states<T: Real>(
         let index = model.index_of(point);
         let at = |c: usize| c * tables.layout.plane + tables.layout.offset(index);
         let vector = |field: &Field<T>| DVec3::from_array([0, 1, 2].map(|c| field[at(c)].wide()));
-        let (u, springs) = (vector(&state.u), tables.springs.gather(&tables.layout, &state.u, volume_change, point));
+        let (u, springs) =
+            (vector(&state.u), tables.springs.gather(&tables.severed, &tables.layout, &state.u, volume_change, point));
         let spring_n = [0, 1, 2].map(|c| model.spring_force_n(spring_unit, index, springs[c].wide(), u[c]));
         let place_n_per_m = model.scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index);
         let u_m = model.unit_m * u;

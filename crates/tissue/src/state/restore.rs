@@ -8,6 +8,7 @@ use std::sync::Arc;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::{Model, Plan};
+use crate::body::severed::Cuts;
 use crate::body::tables::springs_of;
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
@@ -102,6 +103,7 @@ impl Model {
             scene.damping_n_s_per_m,
             scene.stepping.rate_hz,
             self.plan.substep_s,
+            self.prestrain,
             self.sleep_tolerance,
         ] {
             add(&value.to_bits().to_le_bytes());
@@ -130,6 +132,7 @@ pub(super) struct TypedState<T: Real> {
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     pub(super) inputs: Vec<(u64, usize, ToolInput)>,
     pub(super) tiles: TakenTiles<T>,
+    pub(super) cuts: Cuts,
     pub(super) guard_events: u64,
     pub(super) substeps_done: u64,
     pub(super) points_done: u64,
@@ -146,6 +149,7 @@ impl<T: Real> SavedState for TypedState<T> {
             work: checkpoint.work.saved(),
             largest: checkpoint.largest,
             passed_checks: checkpoint.passed_checks,
+            severed: checkpoint.cuts.len() as u64,
         });
         let mut values = Vec::new();
         let mut put = |field: &[T]| {
@@ -174,6 +178,8 @@ impl<T: Real> SavedState for TypedState<T> {
             checkpoint,
             inputs: inputs.collect(),
             tiles: self.tiles.plain(),
+            severed: self.cuts.saved(),
+            topology_version: self.cuts.version(),
             guard_events: self.guard_events,
             substeps_done: self.substeps_done,
             points_done: self.points_done,
@@ -225,6 +231,8 @@ fn restored_as<T: Real>(
     sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
     sheet.work = WorkAccount::restored(&parts.work)?;
     sheet.tiles.restore(&parts.tiles)?;
+    let cuts = Cuts::restored(&parts.severed, parts.topology_version, model)?;
+    sheet.tables.set_severed(model, &cuts);
 
     let size = size_of::<T>();
     ensure(values.len().is_multiple_of(size), "part of a value")?;
@@ -289,6 +297,8 @@ fn checkpoint_of<T: Real>(
     ensure(is_recent, "a state to go back to that is too old")?;
     ensure(saved.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
     ensure((0.0..f64::INFINITY).contains(&saved.largest), "a displacement that is not finite")?;
+    let severed = usize::try_from(saved.severed).unwrap_or(usize::MAX);
+    ensure(severed <= tissue.tables.severed.len(), "more severed springs in its checkpoint than now")?;
     let scale = halved(model, saved.halvings).force_scale(&model.scene);
     Ok(Checkpoint {
         steps: saved.steps,
@@ -300,5 +310,6 @@ fn checkpoint_of<T: Real>(
         work: WorkAccount::restored(&saved.work)?,
         largest: saved.largest,
         passed_checks: saved.passed_checks,
+        cuts: tissue.tables.severed.first(severed),
     })
 }

@@ -38,6 +38,7 @@ impl<T: Real> TissueState<T> {
             self.hold(substep);
             self.touch(substep);
         }
+        self.cut();
         self.end_step();
         self.sleep();
     }

@@ -10,6 +10,8 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::audit_window::{AuditWindow, Mark, WindowInputs};
 use crate::body::force_field::Term;
 use crate::body::model::{Model, Plan, displacement_m};
+use crate::body::severed::Cuts;
+use crate::body::spring_search::SpringSearch;
 use crate::body::tables::{SweepTables, springs_of};
 use crate::body::window::Window;
 use crate::interface::{BlowUp, Energy, PointState, ReadCopy, Released, Tissue};
@@ -77,6 +79,8 @@ pub(crate) struct TissueState<T: Real> {
     pub(super) known_volume_change: Cell<Option<f64>>,
     /// How long the stages of a step take, if that is asked for.
     pub(super) stage_times: Option<StageTimes>,
+    /// What a search for springs begins with, once there was a blade.
+    pub(super) spring_search: Option<SpringSearch>,
 }
 
 impl<T: Real> TissueState<T> {
@@ -104,6 +108,7 @@ impl<T: Real> TissueState<T> {
             points_done: 0,
             known_volume_change: Cell::new(None),
             stage_times: None,
+            spring_search: None,
             plan,
         };
         if model.places.is_pulled() {
@@ -252,7 +257,13 @@ impl<T: Real> Tissue for TissueState<T> {
         memory::check(window.bytes(), "the stiffness under a tool").ok()?;
         let displacement_m = |place: usize| self.displacement_m(self.model.point_of(place));
         let displacement_m = window.points(&self.model).map(displacement_m).collect();
-        Some(TangentInput { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
+        Some(TangentInput {
+            model: self.model.clone(),
+            footprint: tool.footprint.clone(),
+            window,
+            displacement_m,
+            cuts: self.tables.severed.cuts().clone(),
+        })
     }
 
     fn release(&mut self, tool: usize) {
@@ -313,6 +324,10 @@ impl<T: Real> Tissue for TissueState<T> {
     fn point(&self, point: PointId) -> PointState {
         self.keep_growth();
         self.reader().point(self.model.place_of(point))
+    }
+
+    fn cuts(&self) -> Cuts {
+        self.tables.severed.cuts().clone()
     }
 
     fn awake_points(&self) -> usize {
@@ -388,6 +403,9 @@ impl<T: Real> Tissue for TissueState<T> {
     }
 
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
+        if blocks.start == 0 {
+            self.tables.severed.hash(hasher);
+        }
         self.state.hash_blocks(&self.tables.layout, |point| self.tiles.has_moved(point), blocks, hasher);
     }
 

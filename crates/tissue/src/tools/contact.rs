@@ -53,6 +53,7 @@ use glam::DVec3;
 
 use crate::body::footprint::{Footprint, RestSurface, WeightedNode};
 use crate::body::model::{Model, Plan, displacement_m};
+use crate::body::severed::Cuts;
 use crate::body::window::Window;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
@@ -116,13 +117,15 @@ pub struct TangentInput {
     pub(crate) footprint: Footprint,
     pub(crate) window: Window,
     pub(crate) displacement_m: Vec<DVec3>,
+    pub(crate) cuts: Cuts,
 }
 
 impl TangentInput {
     /// Computes stiffness, damping and drag under the tool, in the tissue's frame. Takes some milliseconds for a
     /// thousand points, all on the calling thread.
     pub fn tangent(self) -> Tangent {
-        LinearPatch::new(&self.model, &self.footprint, self.window, self.displacement_m).tangent()
+        let patch = LinearPatch::new(&self.model, &self.footprint, self.window, self.displacement_m);
+        patch.without(&self.cuts).tangent()
     }
 }
 
@@ -135,6 +138,8 @@ pub(crate) struct Tool {
     /// Place at the step's beginning and at its end, m.
     pub(crate) from_m: DVec3,
     pub(crate) to_m: DVec3,
+    /// The edge of a blade at the step's beginning, m; that at its end is the tip's.
+    pub(crate) from_edge_m: DVec3,
     pub(crate) contact_state: ContactState,
     /// Normal of the surface under the disc, on the tool's side.
     pub(crate) normal: DVec3,
@@ -183,6 +188,7 @@ impl Contacts {
             }
             if is_other || tool.tip.grasps != tip.grasps {
                 (tool.contact_state, tool.steady_n, tool.is_new) = (ContactState::Free, DVec3::ZERO, true);
+                tool.from_edge_m = tip.edge_m;
             }
             tool.rigid.iter_mut().for_each(|rigid| rigid.set_friction(tip.friction));
             (tool.to_m, tool.tip) = (to_m, tip);
@@ -195,6 +201,7 @@ impl Contacts {
             footprint: Footprint::new(model, tip.radius_m, to_m),
             from_m: to_m,
             to_m,
+            from_edge_m: tip.edge_m,
             contact_state: ContactState::Free,
             normal: DVec3::Z,
             side: None,
@@ -256,7 +263,7 @@ impl Contacts {
     pub(crate) fn finish(&mut self, rate_hz: f64) {
         for tool in &mut self.tools {
             tool.velocity_m_per_s = (tool.to_m - tool.from_m) * rate_hz;
-            tool.from_m = tool.to_m;
+            (tool.from_m, tool.from_edge_m) = (tool.to_m, tool.tip.edge_m);
         }
     }
 }
@@ -299,6 +306,7 @@ impl Tool {
             place: self.footprint.saved(),
             from_m: self.from_m.into(),
             to_m: self.to_m.into(),
+            from_edge_m: self.from_edge_m.into(),
             contact_state: CONTACT_STATES.iter().position(|state| *state == self.contact_state).unwrap_or(0) as u8,
             normal: self.normal.into(),
             side: match (self.side, self.rigid.as_ref().and_then(RigidTip::saved)) {
@@ -334,6 +342,7 @@ impl Tool {
             footprint,
             from_m: checks.vector(saved.from_m)?,
             to_m: checks.vector(saved.to_m)?,
+            from_edge_m: checks.vector(saved.from_edge_m)?,
             contact_state: contact_state.unwrap_or(ContactState::Free),
             normal: checks.vector(saved.normal)?,
             side,
@@ -522,7 +531,7 @@ impl Tool {
             jump_n: DVec3::ZERO,
             spread_n: DVec3::ZERO,
         };
-        if self.tip.coupling != Coupling::Constraint || moves_m_per_n == 0.0 {
+        if self.coupling() != Coupling::Constraint || moves_m_per_n == 0.0 {
             return leg;
         }
         let [of_u, of_d] = plan.scheme.kick();
@@ -640,7 +649,7 @@ impl Tool {
     /// Returns whether a spring, or the contact of a rigid tip, couples the tool to the tissue at present.
     pub(crate) fn is_coupled(&self) -> bool {
         self.rigid.is_some()
-            || self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })
+            || self.contact_state != ContactState::Free && matches!(self.coupling(), Coupling::Spring { .. })
     }
 
     /// Returns the energy of that spring, J, while the disc is at `surface_m` and the tool at `place_m`.
@@ -648,7 +657,7 @@ impl Tool {
         if let Some(rigid) = &self.rigid {
             return rigid.stored_j();
         }
-        match self.tip.coupling {
+        match self.coupling() {
             Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
                 let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();
                 // A disc that lags behind stretches nothing along its path.
@@ -665,12 +674,12 @@ impl Tool {
 
     /// Returns the steady force with an impulse for the rest of `force_n`; the next substep begins with
     /// `force_n`.
-    fn kicked_to(&self, force_n: DVec3) -> ContactForce {
+    pub(crate) fn kicked_to(&self, force_n: DVec3) -> ContactForce {
         ContactForce { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n }
     }
 
     /// Returns the force that closes a gap, and gives the disc the tool's velocity if the scheme can do both.
-    fn thrust<T: Real>(
+    pub(crate) fn thrust<T: Real>(
         &self,
         model: &Model,
         plan: &Plan,
@@ -685,7 +694,7 @@ impl Tool {
         let own_m = self.own_movement_m(model, plan);
         let moved_m = movement_m(model, layout, state, &self.footprint);
         let ([kick_u, kick_d], [of_u, of_d]) = (plan.scheme.kick(), plan.scheme.constant());
-        match self.tip.coupling {
+        match self.coupling() {
             Coupling::Constraint => {
                 let determinant = kick_u * of_d - kick_d * of_u;
                 // A two-step scheme moves a point by the change of its velocity: it can only close the gap.

@@ -560,14 +560,14 @@ impl RigidTip {
             let from_m = sample.rest_m + moved_m - place_m;
             let is_within = match shape {
                 TipShape::Sphere => from_m.length_squared() < radius_m * radius_m,
-                TipShape::RigidDisc | TipShape::Disc => from_m.dot(axis) > 0.0,
+                TipShape::RigidDisc | TipShape::Disc | TipShape::Blade => from_m.dot(axis) > 0.0,
             };
             if !is_within && force_n == DVec3::ZERO {
                 continue;
             }
             let (way, deep_m) = match shape {
                 TipShape::Sphere => (from_m.try_normalize().unwrap_or(-axis), radius_m - from_m.length()),
-                TipShape::RigidDisc | TipShape::Disc => (-axis, from_m.dot(axis)),
+                TipShape::RigidDisc | TipShape::Disc | TipShape::Blade => (-axis, from_m.dot(axis)),
             };
             let facing = ((-way.dot(sample.outward) - FACING) / (FACING_WHOLLY - FACING)).clamp(0.0, 1.0);
             let yields = sample.relative_inverse_mass > FIXED_PART;

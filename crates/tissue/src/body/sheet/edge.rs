@@ -8,9 +8,11 @@
 // times slower.
 #![allow(clippy::needless_range_loop)]
 
+use crate::body::sheet::cuts::{COUNTER_DIAGONAL, DIAGONAL, RIGHT};
 use crate::body::sheet::grid::{Grid, difference, excess, load};
 use crate::kernel::field::{BLOCK, Layout};
 use crate::kernel::lanes::Vector;
+use crate::kernel::real::Real;
 use crate::kernel::springs::Springs;
 
 /// The forces of the column to the left of a strip on its first column, for as many rows at a time as a vector has
@@ -92,11 +94,37 @@ impl<V: Vector> Edge<V> {
         if V::any(V::either(structural.is_far(qr.farther(qr)), shear.is_far(qa.farther(qb)))) {
             (wr, wa, wb) = (structural.weight(qr), shear.weight(qa), shear.weight(qb));
         }
+        // As in the sweep: the factors of the differences, and the load that is left of a severed spring.
+        let (mut gr, mut ga, mut gb) = (wr, wa, wb);
+        let mut ties = [r[0].splat(V::Real::default()); 2];
+        if grid.springs.is_tense() {
+            ties = [r[0].splat(structural.tension), r[0].splat(shear.tension)];
+            (gr, ga, gb) = (wr.add(ties[0]), wa.add(ties[1]), wb.add(ties[1]));
+        }
+        if !grid.cuts.is_empty() {
+            // The factors of this column, row by row.
+            let mut factors = [[V::Real::of(1.0); BLOCK]; 3];
+            for k in 0..V::LANES {
+                let cuts = grid.cuts.row(row + k);
+                if !cuts.is_null() {
+                    for (factors, spring) in factors.iter_mut().zip([RIGHT, DIAGONAL, COUNTER_DIAGONAL]) {
+                        // SAFETY: a row of factors has the columns of the sheet.
+                        factors[k] = unsafe { *cuts.add(spring * stride + self.column - 1) };
+                    }
+                }
+            }
+            // SAFETY: a block is as long as the widest vector.
+            let [fr, fa, fb] =
+                unsafe { [V::load(factors[0].as_ptr()), V::load(factors[1].as_ptr()), V::load(factors[2].as_ptr())] };
+            (gr, ga, gb) = (gr.mul(fr), ga.mul(fa), gb.mul(fb));
+            (wr, wa) = (wr.mul(fr).sub(ties[0].minus(ties[0], fr)), wa.mul(fa).sub(ties[1].minus(ties[1], fa)));
+            wb = wb.mul(fb).sub(ties[1].minus(ties[1], fb));
+        }
         let last = r[0].first((rows - 1).saturating_sub(row).min(V::LANES));
         for c in 0..3 {
-            let fr = if c == 1 { wr.mul_add(r[c], wr) } else { wr.mul(r[c]) };
-            let fa = if c < 2 { wa.mul_add(a[c], wa) } else { wa.mul(a[c]) };
-            let fb = [wb.mul_add(b[c], wb), wb.mul_sub(b[c], wb), wb.mul(b[c])][c];
+            let fr = if c == 1 { gr.mul_add(r[c], wr) } else { gr.mul(r[c]) };
+            let fa = if c < 2 { ga.mul_add(a[c], wa) } else { ga.mul(a[c]) };
+            let fb = [gb.mul_add(b[c], wb), gb.mul_sub(b[c], wb), gb.mul(b[c])][c];
             let above = fa.shift(self.leaves[c]);
             // The last row of the sheet has only the spring to the right.
             let across = V::select(last, fb.sub(fr).sub(above), fr.add(above));

@@ -1,6 +1,7 @@
 //! The grid that a sweep reads: displacements, springs, carried forces, and the differences between neighbours.
 #![allow(unsafe_code)]
 
+use super::cuts::SheetCuts;
 use crate::kernel::field::Layout;
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
@@ -10,6 +11,7 @@ use crate::kernel::springs::Springs;
 pub(crate) struct Grid<'a, T> {
     pub(crate) layout: Layout,
     pub(crate) springs: &'a Springs<T>,
+    pub(crate) cuts: &'a SheetCuts<T>,
     /// Displacements: three planes, spacings.
     pub(crate) x: *const T,
     /// Forces that rows leave to those below: three planes of [`CARRY_ROWS`] rows.

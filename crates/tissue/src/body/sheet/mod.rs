@@ -1,5 +1,6 @@
 //! Sheets: mass points in rows and columns.
 
+pub(crate) mod cuts;
 pub(crate) mod edge;
 pub(crate) mod falloff;
 pub(crate) mod footprint;

@@ -32,6 +32,7 @@
 
 use std::ops::Range;
 
+use crate::body::sheet::cuts::{COUNTER_DIAGONAL, DIAGONAL, DOWN, RIGHT, TWO_DOWN, TWO_RIGHT};
 use crate::body::sheet::edge::Edge;
 use crate::body::sheet::grid::{CARRY_ROWS, Grid, difference, excess, load};
 use crate::kernel::field::Layout;
@@ -104,7 +105,8 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     // time. Others gave no time that could be measured: rows with fixed points, rows that are partly
                     // asleep, and springs that bend.
                     let (has_below, duty) = (i + 1 < rows, self.stage.duty(i));
-                    if const { V::IS_REGISTER && !BENDING && !S::ENERGY } && has_below && whole {
+                    let is_plain = !self.grid.springs.is_tense() && self.grid.cuts.row(i).is_null();
+                    if const { V::IS_REGISTER && !BENDING && !S::ENERGY } && has_below && whole && is_plain {
                         if duty == ROW_UNLOADED {
                             self.row::<V, BENDING, true, true, ROW_UNLOADED>(bending, i, span, &mut sums);
                             continue;
@@ -141,6 +143,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
         unsafe {
             let Layout { rows, columns, stride, plane } = self.grid.layout;
             let Springs { structural, shear, .. } = self.grid.springs;
+            let is_tense = !WHOLE && self.grid.springs.is_tense();
             let x = self.grid.x.add(i * stride);
             let zero = V::of(T::default());
             let (down, diagonal) = (self.grid.carry, self.grid.carry.add(stride));
@@ -150,6 +153,8 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let tail = zero.first((columns - 1) % V::LANES);
             let (mut passed, mut passed_two) = (if WHOLE { [zero; 3] } else { left }, [zero; 3]);
             let span = if WHOLE { 0..columns.next_multiple_of(V::LANES) } else { span };
+            // A row with cuts or a pretension is never swept as a whole one.
+            let cuts = if WHOLE { std::ptr::null() } else { self.grid.cuts.row(i) };
             let mut column = span.start;
             while column < span.end {
                 let mask = if column + V::LANES < columns { full } else { tail };
@@ -167,7 +172,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 let qr = excess(r[1], &r, [1, 0, 2]);
                 let (mut d, mut a, mut b) = ([zero; 3], [zero; 3], [zero; 3]);
                 let (mut qd, mut qa, mut qb) = (zero, zero, zero);
-                let (wr, wd, wa, wb);
+                let (mut wr, mut wd, mut wa, mut wb);
                 if BELOW {
                     let (below, beside) = (load(at.add(stride), plane), load(at.add(stride + 1), plane));
                     (d, a, b) = (difference(&below, &here), difference(&beside, &here), difference(&below, &right));
@@ -184,21 +189,66 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 } else {
                     (wr, wd, wa, wb) = (structural.weight(qr).keep(mask), zero, zero, zero);
                 }
-                if S::ENERGY && awake {
-                    let mut sum = structural.energy(qr).keep(mask);
+                // The factors of the differences: with a pretension others than those of the rest vectors.
+                let (mut gr, mut gd, mut ga, mut gb) = (wr, wd, wa, wb);
+                let mut ties = [zero; 4];
+                if is_tense {
+                    let (along, across) = (zero.splat(structural.tension), zero.splat(shear.tension));
+                    ties[RIGHT] = along.keep(mask);
                     if BELOW {
-                        sum = sum.add(structural.energy(qd)).add(shear.energy(qa).add(shear.energy(qb)).keep(mask));
+                        (ties[DOWN], ties[DIAGONAL], ties[COUNTER_DIAGONAL]) =
+                            (along, across.keep(mask), across.keep(mask));
                     }
-                    self.stage.energy(column, sum);
+                    (gr, gd) = (wr.add(ties[RIGHT]), wd.add(ties[DOWN]));
+                    (ga, gb) = (wa.add(ties[DIAGONAL]), wb.add(ties[COUNTER_DIAGONAL]));
+                }
+                let mut whole = [zero; 4];
+                if !WHOLE && !cuts.is_null() {
+                    for spring in [RIGHT, DOWN, DIAGONAL, COUNTER_DIAGONAL] {
+                        whole[spring] = V::load(cuts.add(spring * stride + column));
+                    }
+                    (gr, gd) = (gr.mul(whole[RIGHT]), gd.mul(whole[DOWN]));
+                    (ga, gb) = (ga.mul(whole[DIAGONAL]), gb.mul(whole[COUNTER_DIAGONAL]));
+                    // Of a severed spring the load that held the rest shape is left.
+                    let mut weights = [wr, wd, wa, wb];
+                    for spring in [RIGHT, DOWN, DIAGONAL, COUNTER_DIAGONAL] {
+                        let left = ties[spring].minus(ties[spring], whole[spring]);
+                        weights[spring] = weights[spring].mul(whole[spring]).sub(left);
+                    }
+                    [wr, wd, wa, wb] = weights;
+                }
+                if S::ENERGY && awake {
+                    let mut energies = [structural.energy(qr).keep(mask), zero, zero, zero];
+                    if BELOW {
+                        let (ea, eb) = (shear.energy(qa).keep(mask), shear.energy(qb).keep(mask));
+                        energies = [energies[0], structural.energy(qd), ea, eb];
+                    }
+                    if is_tense {
+                        let half = zero.splat(T::of(0.5));
+                        for (spring, delta) in [(RIGHT, &r), (DOWN, &d), (DIAGONAL, &a), (COUNTER_DIAGONAL, &b)] {
+                            let squares =
+                                delta[2].mul_add(delta[2], delta[1].mul_add(delta[1], delta[0].mul(delta[0])));
+                            energies[spring] = half.mul(ties[spring]).mul_add(squares, energies[spring]);
+                        }
+                    }
+                    if !cuts.is_null() {
+                        let along = [r[1], d[0], a[0].add(a[1]), b[0].sub(b[1])];
+                        for spring in [RIGHT, DOWN, DIAGONAL, COUNTER_DIAGONAL] {
+                            let lost = ties[spring].minus(ties[spring], whole[spring]).mul(along[spring]);
+                            energies[spring] = energies[spring].mul(whole[spring]).sub(lost);
+                        }
+                    }
+                    let [er, ed, ea, eb] = energies;
+                    self.stage.energy(column, er.add(ed).add(ea.add(eb)));
                 }
                 let mut n = [zero; 3];
                 for c in 0..3 {
                     let (down, diagonal) = (down.add(c * plane + column), diagonal.add(c * plane + column));
-                    let fr = if c == 1 { wr.mul_add(r[c], wr) } else { wr.mul(r[c]) };
+                    let fr = if c == 1 { gr.mul_add(r[c], wr) } else { gr.mul(r[c]) };
                     if BELOW {
-                        let fd = if c == 0 { wd.mul_add(d[c], wd) } else { wd.mul(d[c]) };
-                        let fa = if c < 2 { wa.mul_add(a[c], wa) } else { wa.mul(a[c]) };
-                        let fb = [wb.mul_add(b[c], wb), wb.mul_sub(b[c], wb), wb.mul(b[c])][c];
+                        let fd = if c == 0 { gd.mul_add(d[c], wd) } else { gd.mul(d[c]) };
+                        let fa = if c < 2 { ga.mul_add(a[c], wa) } else { ga.mul(a[c]) };
+                        let fb = [gb.mul_add(b[c], wb), gb.mul_sub(b[c], wb), gb.mul(b[c])][c];
                         let across = fb.sub(fr).sub(V::load(diagonal));
                         n[c] = fr.add(fd).add(fa.sub(V::load(down))).add(across.shift(passed[c]));
                         fd.add(fb).store(down);
@@ -215,10 +265,16 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     let mask = zero.first(columns.saturating_sub(2 + column));
                     let r = difference(&load(at.add(2), plane), &here);
                     let q = excess(r[1].add(r[1]), &r, [1, 0, 2]);
-                    let w = bending.weight(q).keep(mask);
+                    let mut w = bending.weight(q).keep(mask);
+                    if !cuts.is_null() {
+                        w = w.mul(V::load(cuts.add(TWO_RIGHT * stride + column)));
+                    }
                     let two = w.add(w);
                     let fr = [w.mul(r[0]), w.mul_add(r[1], two), w.mul(r[2])];
                     let mut energy = if S::ENERGY { bending.energy(q).keep(mask) } else { zero };
+                    if S::ENERGY && !cuts.is_null() {
+                        energy = energy.mul(V::load(cuts.add(TWO_RIGHT * stride + column)));
+                    }
                     for c in 0..3 {
                         let carried = two_down.add(c * plane + column);
                         n[c] = n[c].add(fr[c].sub(fr[c].shift_two(passed_two[c]))).sub(V::load(carried));
@@ -227,7 +283,10 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     if i + 2 < rows {
                         let d = difference(&load(at.add(2 * stride), plane), &here);
                         let q = excess(d[0].add(d[0]), &d, [0, 1, 2]);
-                        let w = bending.weight(q);
+                        let mut w = bending.weight(q);
+                        if !cuts.is_null() {
+                            w = w.mul(V::load(cuts.add(TWO_DOWN * stride + column)));
+                        }
                         let two = w.add(w);
                         let fd = [w.mul_add(d[0], two), w.mul(d[1]), w.mul(d[2])];
                         for c in 0..3 {
@@ -235,7 +294,11 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                             fd[c].store(two_down.add(c * plane + column));
                         }
                         if S::ENERGY {
-                            energy = energy.add(bending.energy(q));
+                            let mut stored = bending.energy(q);
+                            if !cuts.is_null() {
+                                stored = stored.mul(V::load(cuts.add(TWO_DOWN * stride + column)));
+                            }
+                            energy = energy.add(stored);
                         }
                     }
                     if S::ENERGY && awake {

@@ -10,6 +10,7 @@ use super::linear_cells::{LinearCells, resisting};
 use super::neo_hookean::{NeoHookean, Patterns};
 use crate::body::Places;
 use crate::body::model::{Model, Plan};
+use crate::body::severed::Severed;
 use crate::body::tables::{SweepTables, springs_of};
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::lanes::{self, Scalar, Vector};
@@ -179,7 +180,7 @@ fn a_point_has_the_bits_of_a_sweep<T: Real>() {
         let mut largest: f64 = 0.0;
         for point in model.points() {
             let place = model.place_of(point);
-            let one = springs.gather(&layout, &u, 0.0, model.point_of(place));
+            let one = springs.gather(&Severed::default(), &layout, &u, 0.0, model.point_of(place));
             for c in 0..3 {
                 let of_sweep = forces[c * layout.plane + layout.offset(place)].wide();
                 assert_eq!(

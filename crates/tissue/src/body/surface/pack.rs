@@ -11,6 +11,7 @@
 //!   of the block would leave many lanes of the last rows empty. So the springs beyond the *plain* rows are *packed*:
 //!   each lane of such a row has a spring of any point of the block, and its force is moved to that point's lane.
 
+use glam::DVec3;
 use palpate_geometry::work::spend;
 
 use super::order::TABLES;
@@ -22,6 +23,9 @@ use crate::memory;
 
 /// Number of coefficients of a spring.
 pub(super) const COEFFICIENTS: usize = 5;
+
+/// Which of them is the stiffness, the last.
+const STIFFNESS: usize = 4;
 
 /// The springs of a mesh for a number format and a width. Independent of substep and scheme.
 #[derive(Debug)]
@@ -35,6 +39,9 @@ pub(crate) struct MeshSprings<T> {
     pub(super) masses: Option<Field<T>>,
     /// The extra K″/m of each slot divided by the reference value. `None` if all are 0.
     pub(super) extra: Option<Field<T>>,
+    /// Σ (k/m)·D0 of the severed springs of each slot, three planes of the layout: what a pretension leaves of them. `None` if
+    /// nothing is severed.
+    pub(super) loads: Option<Field<T>>,
 }
 
 #[derive(Debug)]
@@ -125,7 +132,64 @@ impl<T: Real> MeshSprings<T> {
             Arrangement::Rows(Rows::new(slots, shape.lanes))
         };
         let (masses, extra) = (of_slots(slots.masses()), of_slots(slots.extra()));
-        MeshSprings { shape, slots: slots.vertex_of().len(), arrangement, masses, extra }
+        MeshSprings { shape, slots: slots.vertex_of().len(), arrangement, masses, extra, loads: None }
+    }
+}
+
+impl<T: Real> MeshSprings<T> {
+    /// Sets what is left of the severed springs of a slot under a pretension; `is_severed` tells which of its springs are.
+    pub(crate) fn set_load(&mut self, slots: &MeshSlots, slot: usize, is_severed: impl Fn(usize) -> bool) {
+        let of = slots.springs(slot).iter().enumerate().filter(|(number, _)| is_severed(*number));
+        let load: DVec3 = of.map(|(_, half)| half.stiffness * half.rest).sum();
+        let plane = slots.layout::<T>().plane;
+        let loads = self.loads.get_or_insert_with(|| Field::of_length(3 * plane));
+        for c in 0..3 {
+            loads[c * plane + slot] = T::of(load[c]);
+        }
+    }
+
+    /// Severs or restores the spring of a slot that has this number, at this end. The others stay as they are.
+    pub(crate) fn set(&mut self, slots: &MeshSlots, slot: usize, number: usize, is_severed: bool) {
+        let half = &slots.springs(slot)[number];
+        let values = coefficients::<T>(half);
+        let stiffness = STIFFNESS * self.shape.lanes;
+        let set = |row: &mut [T], lane: usize| {
+            let lanes = row.len() / COEFFICIENTS;
+            let is_this = (0..STIFFNESS).all(|which| row[which * lanes + lane] == values[which]);
+            // Several springs may join the same points: one that is whole, or one that is severed.
+            let was_severed = row[stiffness + lane] == T::default();
+            let is_found = is_this && was_severed != is_severed;
+            if is_found {
+                row[stiffness + lane] = if is_severed { T::default() } else { values[STIFFNESS] };
+            }
+            is_found
+        };
+        let length = COEFFICIENTS * self.shape.lanes;
+        match &mut self.arrangement {
+            Arrangement::Rows(rows) => {
+                let row = rows.firsts[slot / self.shape.lanes] as usize + number;
+                set(&mut rows.coefficients[row * length..][..length], slot % self.shape.lanes);
+            }
+            Arrangement::Halo(halo) => {
+                let Halo { firsts, parts, coefficients, owners, .. } = halo;
+                let [from, to] = [0, 1].map(|next| firsts[slot / BLOCK + next] as usize);
+                let lane = slot % BLOCK;
+                for part in &parts[from..to] {
+                    let first = part.row as usize;
+                    for row in 0..(part.plain + part.packed) as usize {
+                        let values = &mut coefficients[(first + row) * length..][..length];
+                        let packed = row.checked_sub(part.plain as usize);
+                        let is_found = match packed.map(|packed| &owners[part.first_packed as usize + packed]) {
+                            None => set(values, lane),
+                            Some(owners) => (0..BLOCK).any(|n| owners.lane(n) == lane && set(values, n)),
+                        };
+                        if is_found {
+                            return;
+                        }
+                    }
+                }
+            }
+        }
     }
 }
 
@@ -312,8 +376,6 @@ fn plain_rows(springs: &[&[HalfSpring]; BLOCK]) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec3;
-
     use super::*;
 
     /// Returns the number of plain rows of a block in which `filled[k]` lanes have a k-th spring.

@@ -156,8 +156,13 @@ impl MeshSlots {
         &self.halves[self.firsts[slot] as usize..self.firsts[slot + 1] as usize]
     }
 
+    /// Returns the number of the first half of a slot's springs among the halves of all slots.
+    pub(crate) fn first_half(&self, slot: usize) -> usize {
+        self.firsts[slot] as usize
+    }
+
     /// Returns the number of all halves of springs.
-    pub(super) fn count(&self) -> usize {
+    pub(crate) fn count(&self) -> usize {
         self.halves.len()
     }
 

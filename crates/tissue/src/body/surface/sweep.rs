@@ -91,6 +91,8 @@ struct AtHand<T> {
     push: T,
     areas: *const T,
     plane: usize,
+    /// What is left of severed springs ([`MeshSprings::loads`]); null if nothing is.
+    loads: *const T,
     /// Values of the slots, null if all are the same ([`MeshSprings`]).
     extra: *const T,
     masses: *const T,
@@ -117,8 +119,8 @@ impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
         assert!(records.len() == record_place(slot_count) && copied.len() == slots.tiles());
         let of = |field: &Option<Field<T>>| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr());
         let ((push, areas), plane) = (*push, layout.plane);
-        let (extra, masses) = (of(&springs.extra), of(&springs.masses));
-        let at_hand = AtHand { unit: **unit, pull: *pull, push, areas, plane, extra, masses };
+        let (extra, masses, loads) = (of(&springs.extra), of(&springs.masses), of(&springs.loads));
+        let at_hand = AtHand { unit: **unit, pull: *pull, push, areas, plane, loads, extra, masses };
         let records = records.as_mut_ptr();
         // SAFETY: the caller's promise, and the springs and records are those of the slots.
         unsafe {
@@ -228,6 +230,18 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
                 let push = x[0].splat(at_hand.push);
                 for c in 0..3 {
                     sum.force[c] = sum.force[c].minus(push, V::load(at_hand.areas.add(c * at_hand.plane + at)));
+                }
+            }
+            if !at_hand.loads.is_null() {
+                let tension = x[0].splat(unit.tension);
+                for c in 0..3 {
+                    let load = V::load(at_hand.loads.add(c * at_hand.plane + at));
+                    sum.force[c] = sum.force[c].minus(tension, load);
+                    if S::ENERGY {
+                        // All of it belongs to this end.
+                        let stored = tension.mul(load).mul(x[c]);
+                        sum.energy = sum.energy.add(stored.add(stored));
+                    }
                 }
             }
             if S::ENERGY {
@@ -385,7 +399,17 @@ impl<T: Real> ByHalo<T> {
                 let strain = Strain::of(&ends.others(row), &owner, coefficients);
                 let weight = strain.weight::<NEAR>(unit, coefficients, &mut sum.farthest);
                 let energy = if ENERGY { strain.energy(unit, coefficients) } else { weight };
-                let [x, y, z] = strain.span;
+                let is_tense = unit.tension != T::default();
+                // With a pretension the factors are those of the force itself.
+                let (weight, [x, y, z]) = if is_tense {
+                    let (mut force, tie) = (strain.span, strain.tie(unit, coefficients));
+                    for c in 0..3 {
+                        force[c] = tie.mul_add(strain.delta[c], weight.mul(strain.span[c]));
+                    }
+                    (weight.splat(T::of(1.0)), force)
+                } else {
+                    (weight, strain.span)
+                };
                 let end_of_passes = pass + usize::from(*self.passes.add(packed));
                 while pass < end_of_passes {
                     let names = self.returns.add(pass);
@@ -432,6 +456,12 @@ impl<V: Vector> Sum<V> {
             let weight = strain.weight::<NEAR>(unit, coefficients, &mut self.farthest);
             for c in 0..3 {
                 self.force[c] = weight.mul_add(strain.span[c], self.force[c]);
+            }
+            if unit.tension != V::Real::default() {
+                let tie = strain.tie(unit, coefficients);
+                for c in 0..3 {
+                    self.force[c] = tie.mul_add(strain.delta[c], self.force[c]);
+                }
             }
             if ENERGY {
                 self.energy = self.energy.add(strain.energy(unit, coefficients));
@@ -509,8 +539,9 @@ unsafe fn sum_rows<V: Vector, const NEAR: bool, const ENERGY: bool>(
 /// A row of springs under strain.
 struct Strain<V> {
     q: V,
-    /// The vectors e from end to end.
+    /// The vectors e from end to end, and what they are more than at rest.
     span: [V; 3],
+    delta: [V; 3],
 }
 
 impl<V: Vector> Strain<V> {
@@ -520,16 +551,16 @@ impl<V: Vector> Strain<V> {
     unsafe fn of(other: &[V; 3], own: &[V; 3], coefficients: *const V::Real) -> Self {
         // Keeps the squares of small differences above the subnormal range, as `grid::excess` does.
         let mut excess = own[0].splat(V::Real::of(V::Real::FAINT));
-        let mut span = *own;
+        let (mut span, mut delta) = (*own, *own);
         // SAFETY: the caller's promise.
         unsafe {
             for c in 0..3 {
                 let rest = V::load(coefficients.add(c * V::LANES));
-                let delta = other[c].sub(own[c]);
-                span[c] = rest.add(delta);
-                excess = delta.mul_add(rest.add(span[c]), excess);
+                delta[c] = other[c].sub(own[c]);
+                span[c] = rest.add(delta[c]);
+                excess = delta[c].mul_add(rest.add(span[c]), excess);
             }
-            Strain { q: excess.mul(V::load(coefficients.add(3 * V::LANES))), span }
+            Strain { q: excess.mul(V::load(coefficients.add(3 * V::LANES))), span, delta }
         }
     }
 
@@ -558,6 +589,16 @@ impl<V: Vector> Strain<V> {
         unsafe { weight.mul(V::load(coefficients.add(4 * V::LANES))) }
     }
 
+    /// Returns the factor of the difference from rest that gives the force of the pretension.
+    ///
+    /// # Safety
+    /// As for [`Strain::of`].
+    #[inline(always)]
+    unsafe fn tie(&self, unit: &SpringCoefficients<V::Real>, coefficients: *const V::Real) -> V {
+        // SAFETY: the caller's promise.
+        unsafe { self.q.splat(unit.tension).mul(V::load(coefficients.add(4 * V::LANES))) }
+    }
+
     /// # Safety
     /// As for [`Strain::of`].
     #[inline(always)]
@@ -569,13 +610,19 @@ impl<V: Vector> Strain<V> {
                 let rest = V::load(coefficients.add(c * V::LANES));
                 squared = rest.mul_add(rest, squared);
             }
-            unit.energy(self.q).mul(squared).mul(V::load(coefficients.add(4 * V::LANES)))
+            let mut energy = unit.energy(self.q).mul(squared).mul(V::load(coefficients.add(4 * V::LANES)));
+            if unit.tension != V::Real::default() {
+                let [x, y, z] = self.delta;
+                let squares = z.mul_add(z, y.mul_add(y, x.mul(x)));
+                energy = self.tie(unit, coefficients).mul(squares).mul_add(energy.splat(V::Real::of(0.5)), energy);
+            }
+            energy
         }
     }
 }
 
 /// Returns the force of the springs and of the extra anchor stiffness on one slot, minus the pressure
-/// `pressed`. For a few single points. `unit` and `pull` as in [`MeshGrid`].
+/// `pressed`. Of a spring that `is_severed`, by its number, only the load that held the rest shape against its pretension is left. For a few single points. `unit` and `pull` as in [`MeshGrid`].
 #[inline(always)]
 pub(crate) fn gather<T: Real>(
     slots: &MeshSlots,
@@ -584,13 +631,20 @@ pub(crate) fn gather<T: Real>(
     pressed: Option<(T, [T; 3])>,
     u: &[T],
     slot: usize,
+    is_severed: impl Fn(usize) -> bool,
 ) -> [T; 3] {
     let plane = slots.layout::<T>().plane;
     let at = |slot: usize| std::array::from_fn(|c| Scalar(u[c * plane + slot]));
     let own: [Scalar<T>; 3] = at(slot);
     let mut sum = Sum::zero(&own);
-    for half in slots.springs(slot) {
+    for (number, half) in slots.springs(slot).iter().enumerate() {
         let coefficients = coefficients::<T>(half);
+        if is_severed(number) {
+            for c in 0..3 {
+                sum.force[c] = sum.force[c].minus(Scalar(unit.tension * coefficients[4]), Scalar(coefficients[c]));
+            }
+            continue;
+        }
         // SAFETY: the coefficients are those of a row of one spring.
         unsafe {
             let strain = Strain::of(&at(half.to as usize), &own, coefficients.as_ptr());

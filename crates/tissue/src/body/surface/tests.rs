@@ -185,7 +185,8 @@ fn pulls_as_the_reference<T: Real>() {
                 let near = (found - force).abs().cmple(within).all();
                 assert!(near, "{count} {valence} {strain} {vertex}: {found} {force} ± {within}");
                 let slot = slots.slot_of()[vertex] as usize;
-                let alone = gather(&slots, &SpringCoefficients::<T>::new(SCALE, 1.0), T::of(PULL), None, &u, slot);
+                let alone =
+                    gather(&slots, &SpringCoefficients::<T>::new(SCALE, 1.0), T::of(PULL), None, &u, slot, |_| false);
                 let swept = std::array::from_fn(|c| n[c * slots.layout::<T>().plane + slot]);
                 assert_eq!(alone, swept, "{count} {valence} {strain} {vertex}");
             }
@@ -262,12 +263,13 @@ fn flat(springs: &scene::Springs, [rows, columns]: [usize; 2]) -> MeshGraph {
 fn a_flat_mesh_with_a_sheets_springs_pulls_as_the_sheet_does() {
     let mut dice = fastrand::Rng::with_seed(3);
     for bending in [false, true] {
-        let springs = scene::Springs { stiffness_n_per_m: 3.0, shear_stiffness_n_per_m: 1.5, bending };
+        let springs =
+            scene::Springs { stiffness_n_per_m: 3.0, shear_stiffness_n_per_m: 1.5, bending, pretension_n_per_m: 0.0 };
         let size @ [rows, columns] = [19, 33];
         let graph = flat(&springs, size);
         let slots = MeshSlots::new(&graph).unwrap();
         let sheet = Layout::new::<f32>(size);
-        let sheets_springs = Springs::<f32>::new(&springs, SCALE);
+        let sheets_springs = Springs::<f32>::new(&springs, 0.0, SCALE);
         for strain in [1e-6, 1e-3, 0.1] {
             let u = displaced::<f32>(&slots, strain, &mut dice);
             let mut sheets_u = Field::zero(&sheet);
@@ -279,7 +281,7 @@ fn a_flat_mesh_with_a_sheets_springs_pulls_as_the_sheet_does() {
             let (n, _) = sweep_all::<f32, false>(&slots, Lanes::Auto, &u);
             let most = n.iter().fold(0.0_f32, |most, n| most.max(n.abs()));
             for index in 0..rows * columns {
-                let truth = sheets_springs.gather(&sheet, &sheets_u, [index / columns, index % columns]);
+                let truth = sheets_springs.gather(&sheet, &sheets_u, [index / columns, index % columns], |_| false);
                 let found = u_of(&slots, &n, index as u32);
                 let away = found.distance(DVec3::from_array(truth.map(f64::from)));
                 assert!(away <= 1e-6 * f64::from(most), "{strain} {index}: {found} {truth:?}");

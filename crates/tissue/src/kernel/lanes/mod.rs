@@ -203,6 +203,11 @@ impl Names {
         Names { lanes, mask: mask(|lane| usize::from(lanes[lane]) >= 2 * count) }
     }
 
+    /// Returns the lane that `lane` picks.
+    pub(crate) fn lane(&self, lane: usize) -> usize {
+        usize::from(self.lanes[lane])
+    }
+
     /// Creates names for some lanes.
     pub(crate) fn of_some(lanes: [Option<u8>; MAX_LANES]) -> Self {
         Names { lanes: lanes.map(Option::unwrap_or_default), mask: mask(|lane| lanes[lane].is_some()) }

@@ -1,5 +1,6 @@
 //! The guard's data: checkpoints to go back to.
 
+use crate::body::severed::Cuts;
 use crate::kernel::field::State;
 use crate::kernel::real::Real;
 use crate::state::guard::work_account::WorkAccount;
@@ -22,6 +23,7 @@ pub(crate) struct Checkpoint<T: Real> {
     pub(crate) largest: f64,
     /// Whether the motion that led here has passed the checks, under the present springs.
     pub(crate) passed_checks: bool,
+    pub(crate) cuts: Cuts,
 }
 
 /// Steps that the guard repeats from its checkpoint.

@@ -20,6 +20,7 @@ pub(crate) mod work_account;
 use std::sync::Arc;
 
 use crate::body::model::{Model, Plan};
+use crate::body::severed::Severed;
 use crate::body::tables::Elastic;
 use crate::kernel::field::{Field, Layout, State};
 use crate::kernel::real::Real;
@@ -66,10 +67,10 @@ pub(crate) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &Stat
 }
 
 /// Converts a state from one substep to another. `from` and `to` are plans of the same scheme; `springs` are
-/// those of `from`; `volume_change` is the growth of the volume.
+/// those of `from`, less the severed ones; `volume_change` is the growth of the volume.
 pub(crate) fn convert<T: Real>(
     layout: &Layout,
-    springs: &Elastic<T>,
+    (springs, severed): (&Elastic<T>, &Severed),
     [from, to]: [&Plan; 2],
     applied: &Applied<T>,
     volume_change: f64,
@@ -78,8 +79,9 @@ pub(crate) fn convert<T: Real>(
     let ratio = to.substep_s / from.substep_s;
     let points = layout.rows * layout.columns;
     // Compute all forces first: points are converted one by one, in place.
-    let force =
-        |index| springs.gather(layout, &state.u, volume_change, [index / layout.columns, index % layout.columns]);
+    let force = |index| {
+        springs.gather(severed, layout, &state.u, volume_change, [index / layout.columns, index % layout.columns])
+    };
     let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a tissue");
     for (index, force) in forces.iter().enumerate() {
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);

@@ -125,7 +125,7 @@ pub(crate) struct SleepTiles<T> {
     touched: Marks,
     /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved:
     /// their values are 0.
-    moved: Marks,
+    pub(crate) moved: Marks,
     /// The recent largest displacement, spacings.
     pub(crate) largest: f64,
 }

@@ -1,0 +1,262 @@
+//! The springs of a tissue that have been severed. They are part of its state: the model never changes.
+//!
+//! A spring is known by its first end (the one with the lower place in memory) and by its number among the springs of that
+//! end ([`Model::springs_at`]). Each change of the set has a version, which only grows: also if the guard goes back to a
+//! checkpoint and so undoes a cut.
+
+use std::ops::Deref;
+use std::sync::Arc;
+
+use xxhash_rust::xxh3::Xxh3;
+
+use crate::body::model::Model;
+use crate::saved::{SavedSpring, ensure, unsound};
+use crate::shape::PointId;
+use palpate_refusal::Result;
+
+/// A severed spring.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct SeveredSpring {
+    /// The places of its ends, ascending.
+    pub(crate) ends: [u32; 2],
+    /// Its number among the springs of the first end.
+    pub(crate) number: u32,
+    /// Where it was severed: the part of the way from the first end to the second, 0 to 1.
+    pub(crate) part: f64,
+    /// The version of the topology since which it is severed.
+    pub(crate) version: u32,
+}
+
+/// The severed springs of a tissue, in the order in which they were severed. Clones share the list.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Cuts {
+    springs: Arc<Vec<SeveredSpring>>,
+    version: u32,
+    /// The version since which springs were severed only, and none became whole again.
+    grows_since: u32,
+}
+
+/// A spring that is severed, by its points ([`Cuts::joints`]).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SeveredJoint {
+    /// The points that it joined.
+    pub points: [PointId; 2],
+    /// Where it was severed: the part of the way from the first point to the second, 0 to 1.
+    pub part: f64,
+    /// The version of the topology since which it is severed.
+    pub version: u32,
+}
+
+impl Cuts {
+    /// Returns the version of the topology: 0 while the tissue is as its model has it. It grows by 1 with each step in which anything is
+    /// severed, and when the guard goes back to before a cut; it never falls.
+    pub fn version(&self) -> u32 {
+        self.version
+    }
+
+    /// Returns whether a client that knows the springs of version `since` needs only those of later versions; otherwise it needs all,
+    /// because since then the guard has undone a cut, or the session was restored.
+    pub fn continues(&self, since: u32) -> bool {
+        (self.grows_since..=self.version).contains(&since)
+    }
+
+    /// Returns the number of severed springs.
+    pub fn len(&self) -> usize {
+        self.springs.len()
+    }
+
+    /// Returns whether the tissue is whole.
+    pub fn is_empty(&self) -> bool {
+        self.springs.is_empty()
+    }
+
+    /// Returns the severed springs by their points, in the order in which they were severed. `model` is that of the tissue.
+    pub fn joints(&self, model: &Model) -> Vec<SeveredJoint> {
+        let of = |spring: &SeveredSpring| SeveredJoint {
+            points: spring.ends.map(|place| model.point_at(place as usize)),
+            part: spring.part,
+            version: spring.version,
+        };
+        self.springs.iter().map(of).collect()
+    }
+
+    /// Returns the number of parts into which the severed springs divide the tissue: 1 for one that is whole. Points that the model
+    /// joins to no other do not count. Looks at all springs. `model` is that of the tissue.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn pieces(&self, model: &Model) -> usize {
+        let (severed, count) = (Severed::of(self, model), model.place_count());
+        let mut parents: Vec<u32> = (0..count as u32).collect();
+        let mut is_joined = vec![false; count];
+        let mut joints = 0;
+        for place in 0..count {
+            for spring in model.springs_at(place).filter(|spring| spring.other > place) {
+                is_joined[place] = true;
+                is_joined[spring.other] = true;
+                if severed.has(model.first_end(place) + spring.number) {
+                    continue;
+                }
+                let [one, other] = [place, spring.other].map(|place| root(&mut parents, place as u32));
+                if one != other {
+                    parents[one.max(other) as usize] = one.min(other);
+                    joints += 1;
+                }
+            }
+        }
+        (is_joined.into_iter().filter(|joined| *joined).count() - joints).max(1)
+    }
+
+    /// Returns the severed springs.
+    pub(crate) fn springs(&self) -> &[SeveredSpring] {
+        &self.springs
+    }
+
+    /// Returns how many springs at the beginning of the list `other` has as well.
+    pub(crate) fn shared_with(&self, other: &Self) -> usize {
+        if Arc::ptr_eq(&self.springs, &other.springs) {
+            return self.springs.len();
+        }
+        self.springs.iter().zip(&*other.springs).take_while(|(one, other)| one == other).count()
+    }
+
+    /// Returns the first `count` springs.
+    pub(crate) fn first(&self, count: usize) -> Self {
+        let springs = &self.springs[..count.min(self.springs.len())];
+        let version = springs.last().map_or(0, |last| last.version);
+        Cuts { version, grows_since: self.grows_since, springs: Arc::new(springs.to_vec()) }
+    }
+
+    /// Adds the springs to the hash of a tissue; nothing if none is severed.
+    pub(crate) fn hash(&self, hasher: &mut Xxh3) {
+        for SeveredSpring { ends: [place, _], number, part, .. } in &*self.springs {
+            hasher.update(&place.to_le_bytes());
+            hasher.update(&number.to_le_bytes());
+            hasher.update(&part.to_bits().to_le_bytes());
+        }
+    }
+
+    /// Converts the springs to plain data.
+    pub(crate) fn saved(&self) -> Vec<SavedSpring> {
+        let of = |spring: &SeveredSpring| SavedSpring {
+            place: spring.ends[0],
+            number: spring.number,
+            part: spring.part,
+            version: spring.version,
+        };
+        self.springs.iter().map(of).collect()
+    }
+
+    /// Checks saved springs and returns them; `version` is that of the topology.
+    pub(crate) fn restored(saved: &[SavedSpring], version: u32, model: &Model) -> Result<Self> {
+        let mut severed = Severed::default();
+        for SavedSpring { place, number, part, version: since } in saved.iter().copied() {
+            let last = severed.springs.last().map_or(1, |last| last.version);
+            ensure((last..=version).contains(&since), "a severed spring of another version of the topology")?;
+            ensure((0.0..=1.0).contains(&part), "a spring severed beyond its ends")?;
+            ensure((place as usize) < model.place_count(), "a severed spring at a place that the tissue lacks")?;
+            let found = model.springs_at(place as usize).find(|spring| spring.number == number as usize);
+            let other = found.map(|spring| spring.other).filter(|other| *other > place as usize);
+            let other = other.and_then(|other| u32::try_from(other).ok());
+            let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
+            let spring = SeveredSpring { ends: [place, other], number, part, version: since };
+            ensure(severed.add(model, spring), "a spring that is severed twice")?;
+        }
+        Ok(Cuts { version, grows_since: version, ..severed.cuts })
+    }
+}
+
+/// The severed springs of a tissue, and at which ends of springs they are.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Severed {
+    cuts: Cuts,
+    /// A bit for each spring at each of its ends; empty if nothing is severed.
+    ends: Vec<u64>,
+}
+
+impl Deref for Severed {
+    type Target = Cuts;
+
+    fn deref(&self) -> &Cuts {
+        &self.cuts
+    }
+}
+
+impl Severed {
+    /// Returns the set of some severed springs.
+    pub(crate) fn of(cuts: &Cuts, model: &Model) -> Self {
+        let mut severed = Severed { cuts: cuts.clone(), ends: Vec::new() };
+        cuts.springs.iter().for_each(|spring| severed.mark(model, spring, true));
+        severed
+    }
+
+    /// Returns the severed springs.
+    pub(crate) fn cuts(&self) -> &Cuts {
+        &self.cuts
+    }
+
+    /// Returns whether a spring is severed, by the number of its end among those of all places ([`Model::first_end`]).
+    #[inline(always)]
+    pub(crate) fn has(&self, end: usize) -> bool {
+        self.ends.get(end / 64).is_some_and(|bits| bits >> (end % 64) & 1 != 0)
+    }
+
+    /// Adds a spring. Returns whether it was whole.
+    pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> bool {
+        let [end, _] = spring.ends_of(model);
+        if self.has(end) {
+            return false;
+        }
+        self.mark(model, &spring, true);
+        Arc::make_mut(&mut self.cuts.springs).push(spring);
+        true
+    }
+
+    /// Begins a version of the topology.
+    pub(crate) fn begin_version(&mut self, version: u32) {
+        self.cuts.version = version;
+    }
+
+    /// Makes the severed springs those of `cuts`, in a new version if that changes anything. Returns the springs that are whole again, and
+    /// those that no longer are.
+    pub(crate) fn replace(&mut self, model: &Model, cuts: &Cuts) -> [Vec<SeveredSpring>; 2] {
+        let shared = self.cuts.shared_with(cuts);
+        let changed = [&self.cuts, cuts].map(|cuts| cuts.springs[shared..].to_vec());
+        let [whole, severed] = &changed;
+        whole.iter().for_each(|spring| self.mark(model, spring, false));
+        severed.iter().for_each(|spring| self.mark(model, spring, true));
+        let is_same = whole.is_empty() && severed.is_empty();
+        let version = if is_same { self.cuts.version } else { (self.cuts.version + 1).max(cuts.version) };
+        let grows_since = if is_same { self.cuts.grows_since } else { version };
+        self.cuts = Cuts { version, grows_since, springs: cuts.springs.clone() };
+        changed
+    }
+
+    /// Sets the bits of a spring.
+    fn mark(&mut self, model: &Model, spring: &SeveredSpring, is_severed: bool) {
+        if self.ends.is_empty() {
+            self.ends.resize(model.end_count().div_ceil(64), 0);
+        }
+        for end in spring.ends_of(model) {
+            let bit = 1 << (end % 64);
+            if is_severed { self.ends[end / 64] |= bit } else { self.ends[end / 64] &= !bit }
+        }
+    }
+}
+
+impl SeveredSpring {
+    /// Returns the numbers of both of its ends among those of all places.
+    fn ends_of(&self, model: &Model) -> [usize; 2] {
+        let [first, second] = self.ends.map(|place| place as usize);
+        let number = self.number as usize;
+        [model.first_end(first) + number, model.first_end(second) + model.number_at_other_end(first, number)]
+    }
+}
+
+/// Returns the first place of the part to which a place belongs, and shortens the way to it.
+fn root(parents: &mut [u32], mut place: u32) -> u32 {
+    while parents[place as usize] != place {
+        let above = parents[parents[place as usize] as usize];
+        parents[place as usize] = above;
+        place = above;
+    }
+    place
+}

@@ -1,0 +1,80 @@
+//! The springs of a tissue, seen from their ends: how severed springs are named, and what blades look through.
+
+use glam::DVec3;
+
+use crate::body::Places;
+use crate::body::model::Model;
+use crate::kernel::springs::ENDS;
+
+/// The most springs that a point of a sheet has.
+pub(crate) const SHEET_ENDS: usize = 12;
+
+/// A spring, seen from one of its ends.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SpringEnd {
+    /// Its number among the springs of this end.
+    pub(crate) number: usize,
+    /// The place of the other end.
+    pub(crate) other: usize,
+    /// The vector to the other end at rest, units of length.
+    pub(crate) rest: DVec3,
+    pub(crate) stiffness_n_per_m: f64,
+    /// The part of it that a pretension has.
+    pub(crate) tension_n_per_m: f64,
+}
+
+impl Model {
+    /// Returns the springs of the point at a place in memory, by ascending number. A solid has none.
+    pub(crate) fn springs_at(&self, place: usize) -> impl Iterator<Item = SpringEnd> + '_ {
+        let springs = &self.scene.springs;
+        let bending = if springs.bending { springs.stiffness_n_per_m } else { 0.0 };
+        let stiffnesses = [springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m, bending];
+        let (point, size) = (self.point_of(place), self.points);
+        let is_sheet = matches!(self.places, Places::Sheet(_));
+        let on_grid = (0..if is_sheet { SHEET_ENDS } else { 0 }).filter_map(move |number| {
+            let ([di, dj], stiffness_n_per_m) = (ENDS[number / 4][number % 4], stiffnesses[number / 4]);
+            let [i, j] = [point[0].checked_add_signed(di)?, point[1].checked_add_signed(dj)?];
+            #[allow(clippy::cast_precision_loss)]
+            let rest = DVec3::new(di as f64, dj as f64, 0.0);
+            let other = (i < size[0] && j < size[1]).then(|| self.index_of([i, j]))?;
+            let tension_n_per_m = if number < 8 { self.prestrain * stiffness_n_per_m } else { 0.0 };
+            let spring = SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m };
+            (stiffness_n_per_m > 0.0).then_some(spring)
+        });
+        let of_mesh = self.places.joined(place).enumerate().map(move |(number, (other, rest, stiffness))| {
+            let stiffness_n_per_m = springs.stiffness_n_per_m * stiffness;
+            let tension_n_per_m = self.prestrain * stiffness_n_per_m;
+            SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m }
+        });
+        on_grid.chain(of_mesh)
+    }
+
+    /// Returns the number of the first of a place's springs, seen from there, among those of all places.
+    pub(crate) fn first_end(&self, place: usize) -> usize {
+        match &self.places {
+            Places::Sheet(_) => SHEET_ENDS * place,
+            Places::Surface(places) => places.slots.first_half(place),
+            Places::Solid(_) => 0,
+        }
+    }
+
+    /// Returns the number of all springs, each counted from both ends; with those that points at the edge of a sheet lack.
+    pub(crate) fn end_count(&self) -> usize {
+        match &self.places {
+            Places::Sheet(_) => SHEET_ENDS * self.place_count(),
+            Places::Surface(places) => places.slots.count(),
+            Places::Solid(_) => 0,
+        }
+    }
+
+    /// Returns the number of a spring of a place among those of its other end. Panics if there is no such spring.
+    pub(crate) fn number_at_other_end(&self, place: usize, number: usize) -> usize {
+        let Places::Surface(places) = &self.places else { return number / 4 * 4 + 3 - number % 4 };
+        let others = || places.joined(place).map(|(other, ..)| other);
+        let other = others().nth(number).unwrap_or_default();
+        // Several springs may join the same points.
+        let before = others().take(number).filter(|to| *to == other).count();
+        let mut back = places.joined(other).enumerate().filter(|(_, (to, ..))| *to == place);
+        back.nth(before).map_or(0, |(number, _)| number)
+    }
+}

@@ -1,0 +1,223 @@
+//! Blades: what their edges sever in a step.
+//!
+//! In a step the edge of a blade sweeps a surface, from the line between its tip and its heel at the step's beginning to that at
+//! the step's end: two triangles. A spring that crosses one of them is severed. The tissue moves as well, so the edge
+//! is taken as it moves against the spring: its line at the beginning is shifted by the way of the spring's middle in this step.
+//!
+//! That way is the velocity at the end of the step times the step, which differs from the true one in second order. So the edge
+//! begins [`BACK`] of its way farther back: two successive sweeps overlap and leave no gap.
+//!
+//! **The same everywhere.** The tests are exact comparisons of signed volumes in f64, from a state that has the same bits on every
+//! machine. A volume of exactly 0 counts as positive. Springs are severed in ascending order.
+//!
+//! **What follows.** With a pretension, a severed spring leaves the load that held the rest shape against it
+//! (`kernel::springs`): the wound gapes. A multistep scheme keeps the past forces of the springs at each point: the present force of a severed
+//! spring is taken out of all of them, as if it had always been severed. Its energy leaves the tissue: it opens the cut. Severing only
+//! lowers the fastest vibration, so the substep stays stable.
+
+use glam::DVec3;
+
+use crate::body::model::{Model, Plan, displacement_m};
+use crate::body::severed::SeveredSpring;
+use crate::body::spring_ends::SpringEnd;
+use crate::body::spring_search::{SpringSearch, places_of};
+use crate::kernel::field::{Layout, State};
+use crate::kernel::real::Real;
+use crate::stage_times::StepStage;
+use crate::state::tissue_state::TissueState;
+use crate::tools::contact::Tool;
+use palpate_haptics::TipShape;
+
+/// By what part of its way the edge begins farther back.
+const BACK: f64 = 0.05;
+
+/// A spring is found if it is at most this many times as long as the longest one at rest.
+const MAX_STRETCH: f64 = 4.0;
+
+/// The way of a blade's edge in a step: tip and heel at its beginning and its end, m.
+#[derive(Debug, Clone, Copy)]
+struct EdgeSweep {
+    from_m: [DVec3; 2],
+    to_m: [DVec3; 2],
+}
+
+impl EdgeSweep {
+    fn of(tool: &Tool) -> Self {
+        let to_m = [tool.to_m, tool.to_m + tool.tip.edge_m];
+        let from_m = [tool.from_m, tool.from_m + tool.from_edge_m];
+        let from_m = [0, 1].map(|end| from_m[end] - BACK * (to_m[end] - from_m[end]));
+        EdgeSweep { from_m, to_m }
+    }
+
+    /// Returns the corners of the box around it.
+    fn bounds_m(&self) -> [DVec3; 2] {
+        let [a, b] = self.from_m;
+        let [c, d] = self.to_m;
+        [a.min(b).min(c).min(d), a.max(b).max(c).max(d)]
+    }
+
+    /// Returns where it crosses the line between two points, the second of which is reached by `span_m` from the first, as the part of
+    /// the way there; `None` if it does not. `moved_m` is the way of the line in the step.
+    fn crosses(&self, from_m: DVec3, span_m: DVec3, moved_m: DVec3) -> Option<f64> {
+        // All places from the first end on: differences are then small.
+        let [tip, heel] = self.from_m.map(|place_m| place_m + moved_m - from_m);
+        let [tip_after, heel_after] = self.to_m.map(|place_m| place_m - from_m);
+        // On which side of the line each directed side of the triangles lies. The diagonal is shared, and the edge's lines are those of
+        // the sweeps before and after: each has one direction, so that a line through it crosses exactly one of both.
+        let is_left = |a: DVec3, b: DVec3| span_m.dot(a.cross(b)) >= 0.0;
+        let diagonal = is_left(tip, heel_after);
+        let (first, last) = (is_left(tip, heel), is_left(tip_after, tip));
+        let (beyond, before) = (is_left(heel, heel_after), !is_left(tip_after, heel_after));
+        let [b, c] = if first == beyond && beyond != diagonal {
+            [heel, heel_after]
+        } else if diagonal == before && before == last {
+            [heel_after, tip_after]
+        } else {
+            return None;
+        };
+        let normal = (b - tip).cross(c - tip);
+        let [begin, end] = [-tip.dot(normal), (span_m - tip).dot(normal)];
+        ((begin >= 0.0) != (end >= 0.0)).then(|| (begin / (begin - end)).clamp(0.0, 1.0))
+    }
+}
+
+/// A spring that a blade crosses.
+#[derive(Debug, Clone, Copy)]
+struct Crossing {
+    place: usize,
+    spring: SpringEnd,
+    part: f64,
+}
+
+impl<T: Real> TissueState<T> {
+    /// Prepares the search for springs, if a tool has a blade.
+    pub(super) fn prepare_to_cut(&mut self) {
+        if self.spring_search.is_none() {
+            let tiles = self.tiles.tile_count();
+            self.spring_search = Some(SpringSearch::of(&self.model, &self.tables.layout, tiles));
+        }
+    }
+
+    /// Severs the springs that blades cross in this step.
+    pub(super) fn cut(&mut self) {
+        let blades = self.contacts.tools.iter().filter(|tool| tool.tip.shape == TipShape::Blade);
+        let sweeps: Vec<EdgeSweep> = blades.map(EdgeSweep::of).collect();
+        if sweeps.is_empty() {
+            return;
+        }
+        self.prepare_to_cut();
+        let mut crossings: Vec<Crossing> = sweeps.iter().flat_map(|sweep| self.crossed(sweep)).collect();
+        crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
+        crossings.dedup_by_key(|crossing| (crossing.place, crossing.spring.number));
+        let version = self.tables.severed.version() + 1;
+        let mut any = false;
+        for crossing in crossings {
+            any |= self.sever(&crossing, version);
+        }
+        if any {
+            self.tables.severed.begin_version(version);
+        }
+        self.ended(StepStage::Contact);
+    }
+
+    /// Returns the springs that a blade crosses, from their first ends; some perhaps twice.
+    fn crossed(&self, sweep: &EdgeSweep) -> Vec<Crossing> {
+        let TissueState { model, plan, tables, state, tiles, spring_search, .. } = self;
+        let (Some(search), mut found) = (spring_search, Vec::new()) else { return Vec::new() };
+        let layout = &tables.layout;
+        let reach_m = DVec3::splat(0.5 * MAX_STRETCH * search.longest_m());
+        let [least_m, most_m] = sweep.bounds_m();
+        let [least_m, most_m] = [least_m - reach_m, most_m + reach_m];
+        let is_within = |place_m: DVec3| place_m.cmpge(least_m).all() && place_m.cmple(most_m).all();
+        let displacement_m = |place: usize| displacement_m(model, layout, state, model.point_of(place));
+        for tile in 0..tiles.tile_count() {
+            let [low_m, high_m] = search.tile_box_m(model, layout, state, &tiles.moved, tile);
+            if high_m.cmplt(least_m).any() || low_m.cmpgt(most_m).any() {
+                continue;
+            }
+            for place in places_of(model, layout, tile) {
+                let mut springs = model.springs_at(place).peekable();
+                if springs.peek().is_none() {
+                    continue;
+                }
+                let (rest_m, u_m) = (model.shape().rest_m(model.point_at(place)), displacement_m(place));
+                if !is_within(rest_m + u_m) {
+                    continue;
+                }
+                for spring in springs {
+                    if tables.severed.has(model.first_end(place) + spring.number) {
+                        continue;
+                    }
+                    let (first, spring) = if spring.other > place {
+                        (place, spring)
+                    } else {
+                        let number = model.number_at_other_end(place, spring.number);
+                        (spring.other, SpringEnd { number, other: place, rest: -spring.rest, ..spring })
+                    };
+                    let [own_m, other_m] = [first, spring.other].map(displacement_m);
+                    let span_m = model.unit_m * spring.rest + (other_m - own_m);
+                    let from_m = if first == place { rest_m + u_m } else { rest_m + u_m - span_m };
+                    let moved_m = 0.5
+                        * (moved_m(model, plan, layout, state, first)
+                            + moved_m(model, plan, layout, state, spring.other));
+                    if let Some(part) = sweep.crosses(from_m, span_m, moved_m) {
+                        found.push(Crossing { place: first, spring, part });
+                    }
+                }
+            }
+        }
+        found
+    }
+
+    /// Severs a spring. Returns whether it was whole.
+    #[allow(clippy::cast_possible_truncation)]
+    fn sever(&mut self, crossing: &Crossing, version: u32) -> bool {
+        let Crossing { place, spring, part } = *crossing;
+        let ends = [place, spring.other];
+        let severed =
+            SeveredSpring { ends: ends.map(|place| place as u32), number: spring.number as u32, part, version };
+        if !self.tables.sever(&self.model, severed) {
+            return false;
+        }
+        let (model, layout) = (self.model.clone(), self.tables.layout);
+        for place in ends {
+            self.tiles.wake_around(model.point_of(place), self.plan.scheme.sweeps());
+        }
+        let [own_m, other_m] = ends.map(|place| displacement_m(&model, &layout, &self.state, model.point_of(place)));
+        let (rest_m, delta_m) = (model.unit_m * spring.rest, other_m - own_m);
+        // 1 − L0/L without cancellation (`kernel::springs`).
+        let q = ((2.0 * rest_m + delta_m).dot(delta_m) / rest_m.length_squared()).max(-1.0);
+        let s = (1.0 + q).sqrt();
+        let extension = q / (1.0 + s);
+        // The force of the spring, less what a pretension leaves of it.
+        let (tension_n_per_m, slack_n_per_m) =
+            (spring.tension_n_per_m, spring.stiffness_n_per_m - spring.tension_n_per_m);
+        let along = if s > 0.0 { slack_n_per_m * extension / s } else { 0.0 };
+        let force_n = (along + tension_n_per_m) * (rest_m + delta_m);
+        let stored_j = 0.5 * slack_n_per_m * rest_m.length_squared() * extension * extension
+            + 0.5 * tension_n_per_m * delta_m.length_squared();
+        self.work.add(-tension_n_per_m * rest_m.dot(delta_m) - stored_j);
+        let unit = self.plan.spring_unit(&model.scene);
+        let history = self.plan.scheme.history();
+        for (place, force_n) in ends.into_iter().zip([force_n, -force_n]) {
+            let change = unit / model.relative_mass_at(place) * force_n;
+            for kept in &mut self.state.kept[..history] {
+                let kept = std::sync::Arc::make_mut(kept);
+                for c in 0..3 {
+                    kept[c * layout.plane + layout.offset(place)] -= T::of(change[c]);
+                }
+            }
+        }
+        true
+    }
+}
+
+/// Returns the way of a point in the present step, m, by its velocity at the end.
+fn moved_m<T: Real>(model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, place: usize) -> DVec3 {
+    let at = layout.offset(place);
+    let component = |c: usize| state.d[c * layout.plane + at].wide();
+    f64::from(plan.substeps) * model.unit_m * DVec3::new(component(0), component(1), component(2))
+}
+
+#[cfg(test)]
+mod tests;

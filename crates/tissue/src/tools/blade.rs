@@ -1,0 +1,77 @@
+//! The force on a blade.
+//!
+//! A blade that is in the tissue is coupled to the place of the surface that its edge pierces, across the edge, by a stiff
+//! spring. Along the edge it slides freely. The spring bears at most R = Gc·d, with the fracture toughness Gc of the tissue and the
+//! depth d of the edge in it: the work of separation of a cut of that depth, for each unit of its way. So a blade first pushes
+//! the tissue ahead; beyond R the place slides with it, and the blade cuts (`state::cutting` severs what its edge then crosses). The work of
+//! R along that way is the fracture work; what the spring stores comes back. The coupling gives no energy.
+
+use palpate_haptics::{ContactState, Coupling, TipShape};
+
+use crate::body::model::{Model, Plan, displacement_m};
+use crate::kernel::field::{Layout, State};
+use crate::kernel::real::Real;
+use crate::tools::contact::{ContactForce, Tool};
+
+/// The spring between a blade and the tissue: a resistance of 1 N yields by 0.2 mm before the blade cuts.
+const COUPLING: Coupling = Coupling::Spring { stiffness_n_per_m: 5000.0, damping_n_s_per_m: 1.0 };
+
+/// The depth of an edge that lies along the surface is counted as if it rose by at least this part of its length.
+const MIN_SLOPE: f64 = 0.1;
+
+impl Tool {
+    /// Returns how the tool is coupled to the tissue.
+    pub(crate) fn coupling(&self) -> Coupling {
+        if self.tip.shape == TipShape::Blade { COUPLING } else { self.tip.coupling }
+    }
+
+    /// Determines the force of a blade on the tissue, N, at the end of a substep, which ends at `fraction` of the step.
+    pub(crate) fn resist<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &State<T>,
+        fraction: f64,
+    ) -> ContactForce {
+        let place_m = self.place_m(fraction);
+        let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
+        let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
+        if self.contact_state == ContactState::Free {
+            self.seek(model, layout, state, place_m, plan.is_first(fraction));
+        }
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        self.normal = self.footprint.outward(&along);
+        self.side = Some(1.0);
+        let below_m = (surface_m - place_m).dot(self.normal);
+        let depth_m = (below_m / edge.dot(self.normal).max(MIN_SLOPE)).min(length_m);
+        let most_n = model.scene.cutting.resistance_n(depth_m);
+        let pierced_m = place_m + depth_m * edge;
+        let is_beside = self.footprint.is_beside(pierced_m - surface_m, self.normal);
+        if below_m <= 0.0 || is_beside || most_n <= 0.0 || self.footprint.relative_inverse_mass() == 0.0 {
+            self.contact_state = ContactState::Free;
+            return ContactForce::default();
+        }
+        if self.contact_state == ContactState::Free {
+            // Where the edge pierces the surface, not where its tip is.
+            self.footprint.seek(model, pierced_m, true, |point| displacement_m(model, layout, state, point));
+            self.contact_state = ContactState::Sticking;
+            return ContactForce::default();
+        }
+        let gap_m = pierced_m - surface_m;
+        let across_m = gap_m - gap_m.dot(edge) * edge;
+        let thrust = self.thrust(model, plan, layout, state, across_m);
+        let (force_n, wanted_n) = (thrust.force_n(), thrust.force_n().length());
+        if wanted_n <= most_n {
+            self.contact_state = ContactState::Sticking;
+            return thrust;
+        }
+        self.contact_state = ContactState::Sliding;
+        let ahead = force_n / wanted_n;
+        let Coupling::Spring { stiffness_n_per_m, .. } = COUPLING else { return thrust };
+        let lag_m = most_n / stiffness_n_per_m;
+        let slid_m = (across_m.dot(ahead) - lag_m).max(0.0).min(self.footprint.stride_m());
+        self.footprint.shift(model, slid_m * ahead, &along);
+        self.kicked_to(most_n * ahead)
+    }
+}
