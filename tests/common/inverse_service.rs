@@ -15,7 +15,7 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use serde_json::{Value, json};
 use tungstenite::Message;
 
@@ -37,6 +37,8 @@ pub enum Wrong {
     Garbage,
     /// A position that no arm reaches.
     Far,
+    /// An orientation of zeros.
+    Unturned,
 }
 
 /// The messages that it received.
@@ -77,6 +79,11 @@ impl Heard {
             told.profiles.push(name.as_str().unwrap().to_owned());
         }
     }
+}
+
+/// The grip turns about the axis upwards, to the left and back: returns its orientation at a tick.
+pub fn turn(tick: u32) -> DQuat {
+    DQuat::from_rotation_z(0.5 + 0.3 * (TAU * f64::from(tick) / 3000.0).sin())
 }
 
 pub struct InverseService {
@@ -139,8 +146,10 @@ fn serve(mut stream: TcpStream, version: Option<&str>, wrong: Wrong, told: &Hear
     };
     let arms = |tick: u32| json!([{ "device_id": "049D", "state": state(tick), "status": { "ready": true } }]);
     let grips = |tick: u32| {
+        let DQuat { w, x, y, z } = turn(tick);
         let buttons = json!({ "a": tick % 300 < 150, "b": false, "c": false });
-        json!([{ "device_id": "62", "state": { "buttons": buttons } }])
+        let orientation = json!({ "w": w, "x": x, "y": y, "z": z });
+        json!([{ "device_id": "62", "state": { "buttons": buttons, "orientation": orientation } }])
     };
     let message = |tick: u32, has_arm: bool| {
         let mut message = json!({ "inverse3": if has_arm { arms(tick) } else { json!([]) } });
@@ -177,6 +186,12 @@ fn serve(mut stream: TcpStream, version: Option<&str>, wrong: Wrong, told: &Hear
             Wrong::Far if is_wrong => {
                 let mut message = message(tick, true);
                 message["inverse3"][0]["state"]["cursor_position"]["z"] = json!(-1e9);
+                message.to_string()
+            }
+            Wrong::Unturned if is_wrong => {
+                let mut message = message(tick, true);
+                message["wireless_verse_grip"][0]["state"]["orientation"] =
+                    json!({ "w": 0.0, "x": 0.0, "y": 0.0, "z": 0.0 });
                 message.to_string()
             }
             _ => message(tick, true).to_string(),

@@ -12,12 +12,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use crate::common::inverse_service::{InverseService, Wrong};
+use crate::common::inverse_service::{InverseService, Wrong, turn};
 use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository};
 use glam::{DQuat, DVec3};
 use palpate_client::bridge::{BridgeReport, Copies, Options, SessionChoice, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
-use palpate_client::{Credentials, HapticDevice, Reading};
+use palpate_client::{Credentials, Error, HapticDevice, Reading};
 use palpate_haptics::device::SAFE_FORCE_N;
 use palpate_haptics::{Device, Instrument, RenderingState, Tip, Wrench};
 
@@ -141,9 +141,13 @@ impl<D: HapticDevice> HapticDevice for NotingWrenches<D> {
     }
 }
 
-/// Leads a shaft of 16 mm on `liver` by a device until it has felt a torque of 0.1 mN·m for some ticks. Returns what the loop asked of
-/// it, with the results.
-async fn lead_shaft(device: Box<dyn HapticDevice>, server: &TestServer) -> (Vec<Wrench>, BridgeReport) {
+/// Leads a shaft of 16 mm on `liver` by a device until it has felt what `is_felt` asks for during some ticks, or has failed. Returns
+/// what the loop asked of it, with the results.
+async fn lead(
+    device: Box<dyn HapticDevice>,
+    server: &TestServer,
+    is_felt: fn(&Wrench) -> bool,
+) -> (Vec<Wrench>, Result<BridgeReport, Error>) {
     let tip = Tip { radius_m: 0.004, ..Tip::default() };
     let mut instrument = Instrument::default();
     instrument.add_parts(None, Some((0.016, tip)));
@@ -153,18 +157,32 @@ async fn lead_shaft(device: Box<dyn HapticDevice>, server: &TestServer) -> (Vec<
     let options = Options { remembers: true, copies, instrument: Some(instrument), ..Options::default() };
     let felt = noted.clone();
     let stop = async move {
-        let is_felt = || felt.lock().unwrap().iter().filter(|wrench| wrench.torque_n_m.length() > 1e-4).count() > 50;
-        while !is_felt() {
+        while felt.lock().unwrap().iter().filter(|wrench| is_felt(wrench)).count() <= 50 {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
     let serving = run(device, target(server), options, stop);
-    let (device, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("no torque").unwrap();
-    drop(device);
-    assert_eq!(report.traffic.refused, 0);
-    assert!(report.predicted_ticks > 0 && report.most_torque_n_m > 1e-4);
+    let ended = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("nothing felt");
     let noted = noted.lock().unwrap().clone();
-    (noted, report)
+    (noted, ended.map(|(_, report)| report))
+}
+
+/// Leads the shaft as [`lead`] does, by a device that does not fail.
+async fn lead_shaft(
+    device: Box<dyn HapticDevice>,
+    server: &TestServer,
+    is_felt: fn(&Wrench) -> bool,
+) -> (Vec<Wrench>, BridgeReport) {
+    let (asked, report) = lead(device, server, is_felt).await;
+    let report = report.unwrap();
+    assert_eq!(report.traffic.refused, 0);
+    assert!(report.predicted_ticks > 0);
+    (asked, report)
+}
+
+/// A torque of 0.1 mN·m.
+fn is_torque(wrench: &Wrench) -> bool {
+    wrench.torque_n_m.length() > 1e-4
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -179,7 +197,7 @@ async fn a_device_of_six_axes_gets_force_and_torque_in_its_own_axes() {
     // −x, point along its −y, to the left.
     assert!((device.orientation() * DVec3::X).distance(DVec3::NEG_X) < 1e-12);
     assert!((device.orientation() * DVec3::Z).distance(DVec3::Z) < 1e-12 && device.jaw_rad() == 0.4);
-    let (asked, _) = lead_shaft(device, &server).await;
+    let (asked, _) = lead_shaft(device, &server, is_torque).await;
     let (forces, torques) = (imitation.log.vectors("force"), imitation.log.vectors("torque"));
     let to_base = |v: DVec3| DVec3::new(-v.y, v.x, v.z);
     // One without torque at the opening, and one of zeros when it is closed.
@@ -205,7 +223,7 @@ async fn a_phantom_gets_torque_in_millinewton_metres_and_none_when_the_loop_stan
     device.read().unwrap();
     // The stylus points to the left: its −z after a quarter turn about y.
     assert!((device.orientation() * DVec3::X).distance(DVec3::NEG_X) < 1e-12, "{}", device.orientation());
-    let (asked, _) = lead_shaft(device, &server).await;
+    let (asked, _) = lead_shaft(device, &server, is_torque).await;
     let torques = imitation.log.vectors("torque");
     let to_library = |v: DVec3| 1e3 * DVec3::new(v.x, v.z, -v.y);
     assert!(torques.iter().filter(|torque| torque.length() > 0.1).count() > 10);
@@ -376,6 +394,50 @@ async fn an_inverse3_is_spoken_to_in_the_words_of_its_services_version() {
         let touching = ours.iter().rfind(|tick| tick.state.is_some()).unwrap();
         let along = DVec3::new(touching.place_m.x, touching.place_m.y, 0.0);
         assert!((along - MIDDLE_M - DVec3::new(0.003, 0.002, 0.0)).length() < 1e-9, "{touching:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_instrument_led_by_an_inverse3_turns_with_its_grip() {
+    let server = TestServer::start(&[]);
+    let service = InverseService::start(Some("3.5.0"), Wrong::Nothing);
+    let mut device = open(&format!("haply:{}", service.url), None).unwrap();
+    let mut seen: Vec<DQuat> = Vec::new();
+    while seen.last().is_none_or(|last| last.angle_between(seen[0]) < 0.01) {
+        assert!(seen.len() < 5000, "it does not turn");
+        device.read().unwrap();
+        device.write(DVec3::ZERO).unwrap();
+        seen.push(device.orientation());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    for turned in seen {
+        // Not turned, it would point away from the operator.
+        let points = turned * DVec3::X;
+        let is_told = (0..3000).any(|tick| (turn(tick) * DVec3::Y).distance(points) < 1e-12);
+        assert!(is_told && (turned * DVec3::Z).distance(DVec3::Z) < 1e-12, "{turned}");
+    }
+    drop(device);
+    let is_pressed = |wrench: &Wrench| wrench.force_n.z > 0.05;
+    for wrong in [Wrong::Nothing, Wrong::Unturned] {
+        let service = InverseService::start(Some("3.5.0"), wrong);
+        let device = open(&format!("haply:{}", service.url), None).unwrap();
+        let asked = if wrong == Wrong::Nothing {
+            let (asked, report) = lead_shaft(device, &server, is_pressed).await;
+            assert!(report.most_torque_n_m == 0.0, "it has no motors for that");
+            asked
+        } else {
+            let (asked, ended) = lead(device, &server, |_| false).await;
+            let said = ended.unwrap_err().to_string();
+            assert!(said.contains("no valid orientation of the grip"), "{said}");
+            asked
+        };
+        assert!(asked.iter().any(is_pressed));
+        let heard = service.heard();
+        until("no force at the end", || heard.forces_n().last() == Some(&DVec3::ZERO));
+        for force_n in heard.forces_n() {
+            assert!(force_n == DVec3::ZERO || asked.iter().any(|asked| near(asked.force_n, force_n)), "{force_n}");
+        }
+        is_bounded(&heard.forces_n());
     }
 }
 

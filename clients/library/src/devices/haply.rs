@@ -3,14 +3,18 @@
 //! The service sends its whole state when a client connects, and after that one state per message. So each tick sends
 //! a force, and reads what has arrived since, without waiting for it. Positions are in metres from the device's base,
 //! x to the right, y forward and z up. Since version 3.5 the force is in the field `vector`, before that in `values`.
+//!
+//! The orientation is that of the first grip that reports one: a quaternion, which we take to turn vectors of the grip into the
+//! device's base. That direction, and the grip's own axes, were not checked on a device.
 
+use std::f64::consts::FRAC_1_SQRT_2;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
 use std::time::{Duration, Instant};
 
-use glam::DVec3;
-use palpate_haptics::Device;
+use glam::{DQuat, DVec3};
 use palpate_haptics::device::UNDECLARED;
+use palpate_haptics::{Device, Wrench};
 use serde_json::{Map, Value, json};
 use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Message, WebSocket};
@@ -42,6 +46,12 @@ const VERSIONS: [(u32, u32); 2] = [(3, 1), (4, 0)];
 /// The version since which a force is a `vector`.
 const VECTOR_SINCE: (u32, u32) = (3, 5);
 
+/// From an instrument, which points along x, to the grip, which we take to point forward while it is not turned.
+const HANDLE: DQuat = DQuat::from_xyzw(0.0, 0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2);
+
+/// Smallest and largest length of a quaternion that counts as an orientation: it is rounded, but neither zero nor something else.
+const QUATERNION_LENGTH: [f64; 2] = [0.99, 1.01];
+
 /// Approximate middle of the workspace, m from the base; not measured on a device.
 const MIDDLE_M: DVec3 = DVec3::new(0.0, -0.12, 0.16);
 
@@ -53,6 +63,7 @@ pub(super) struct Inverse3 {
     field: &'static str,
     place_m: DVec3,
     buttons: u32,
+    grip: Grip,
     unanswered: u32,
     /// When the service last answered, and when it last reported the device's position.
     heard: Instant,
@@ -61,6 +72,37 @@ pub(super) struct Inverse3 {
     is_told: bool,
     /// The force that was sent last, N.
     sent_n: DVec3,
+}
+
+/// What is known of the orientation of the grip.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+enum Grip {
+    /// No grip has reported one: the instrument is not turned.
+    #[default]
+    Unknown,
+    /// The last valid one, and when it came. After an invalid one, or without a grip, it grows old.
+    Told { turn: DQuat, at: Instant },
+    /// No report has been valid yet, since then.
+    Invalid { since: Instant },
+}
+
+impl Grip {
+    /// Applies a message that has arrived `now`. One without a grip, or with an invalid orientation, changes no valid one.
+    fn take(&mut self, message: &Value, now: Instant) {
+        match (orientation(message), &self) {
+            (Some(Ok(turn)), _) => *self = Grip::Told { turn, at: now },
+            (Some(Err(_)), Grip::Unknown) => *self = Grip::Invalid { since: now },
+            _ => {}
+        }
+    }
+
+    /// Returns for how long it has not been known at `now`, although a grip reports orientations.
+    fn lost(&self, now: Instant) -> Duration {
+        match self {
+            Grip::Unknown => Duration::ZERO,
+            Grip::Told { at: since, .. } | Grip::Invalid { since } => now.saturating_duration_since(*since),
+        }
+    }
 }
 
 /// Returns host and port of an address.
@@ -143,6 +185,23 @@ fn id_of(device: &Value) -> Option<&str> {
 fn vector(value: &Value) -> Option<DVec3> {
     let part = |name: &str| value.get(name).and_then(Value::as_f64);
     Some(DVec3::new(part("x")?, part("y")?, part("z")?))
+}
+
+/// Returns the grips in a message: wireless ones first.
+fn grips(message: &Value) -> impl Iterator<Item = &Value> {
+    devices(message, "wireless_verse_grip").chain(devices(message, "verse_grip"))
+}
+
+/// Returns the orientation of the first grip in a message that has that field, of length 1; as an error the field as it is, if it is
+/// no orientation: not four finite numbers, or not of length 1.
+fn orientation(message: &Value) -> Option<Result<DQuat, &Value>> {
+    let told = grips(message).find_map(|grip| grip.get("state")?.get("orientation"))?;
+    let part = |name: &str| told.get(name).and_then(Value::as_f64);
+    let turn = || Some(DQuat::from_xyzw(part("x")?, part("y")?, part("z")?, part("w")?));
+    // What is not finite has no such length.
+    let [least, most] = QUATERNION_LENGTH;
+    let turn = turn().filter(|turn| (least..=most).contains(&turn.length()));
+    Some(turn.map(DQuat::normalize).ok_or(told))
 }
 
 /// Returns the buttons in a message, if it contains any: those of a wireless grip, or the one of a wired grip.
@@ -238,6 +297,7 @@ impl Inverse3 {
             field,
             place_m: DVec3::ZERO,
             buttons: 0,
+            grip: Grip::default(),
             unanswered: 0,
             heard: now,
             told: now,
@@ -260,6 +320,7 @@ impl Inverse3 {
         if let Some(buttons) = buttons(message) {
             self.buttons = buttons;
         }
+        self.grip.take(message, Instant::now());
     }
 
     /// Sends a force, N; the first message also contains the name of this program.
@@ -323,6 +384,25 @@ impl HapticDevice for Inverse3 {
         // A force of zero is sent even to a service that is behind.
         let must = force_n == DVec3::ZERO && self.sent_n != DVec3::ZERO;
         if self.unanswered < UNANSWERED || must { self.send(force_n, false) } else { Ok(()) }
+    }
+
+    fn orientation(&self) -> DQuat {
+        match self.grip {
+            Grip::Told { turn, .. } => turn * HANDLE,
+            Grip::Unknown | Grip::Invalid { .. } => DQuat::IDENTITY,
+        }
+    }
+
+    /// Writes the force: the grip has no motors. An instrument whose orientation is not known gets no force, and after a while the
+    /// touch ends; a single tip does not depend on it.
+    fn write_wrench(&mut self, wrench: Wrench) -> io::Result<()> {
+        let lost = self.grip.lost(Instant::now());
+        if lost > SILENCE {
+            let message = "Haply's Inverse Service reports no valid orientation of the grip (`state.orientation`: a quaternion w, \
+                x, y, z of length 1): is the grip on?";
+            return Err(io::Error::new(ErrorKind::NotConnected, message));
+        }
+        self.write(if lost > STALE { DVec3::ZERO } else { wrench.force_n })
     }
 
     fn buttons(&self) -> u32 {
@@ -389,6 +469,50 @@ mod tests {
         assert_eq!(buttons(&json!({ "verse_grip": [{ "state": { "button": true } }] })), Some(1));
         assert_eq!(buttons(&json!({ "inverse3": [], "verse_grip": [] })), None);
         assert_eq!(buttons(&json!({ "wireless_verse_grip": 3 })), None);
+    }
+
+    #[test]
+    fn the_orientation_is_that_of_the_first_grip_that_reports_a_valid_one() {
+        let grip = |w: f64, x: f64| json!([{ "state": { "orientation": { "w": w, "x": x, "y": 0.0, "z": 0.0 } } }]);
+        let turned = DQuat::from_xyzw(0.8, 0.0, 0.0, 0.6);
+        let wired = json!({ "wireless_verse_grip": [{ "state": {} }], "verse_grip": grip(0.6, 0.8) });
+        let told = orientation(&wired).unwrap().unwrap();
+        assert!(told.angle_between(turned) < 1e-6 && (told.length() - 1.0).abs() < 1e-15, "{told}");
+        let both = json!({ "verse_grip": grip(0.6, 0.8), "wireless_verse_grip": grip(1.0, 0.0) });
+        assert_eq!(orientation(&both), Some(Ok(DQuat::IDENTITY)));
+        for nothing in [json!({}), json!({ "verse_grip": [] }), json!({ "verse_grip": [{ "state": 3 }] })] {
+            assert_eq!(orientation(&nothing), None);
+        }
+        let wrong = |told: Value| json!({ "verse_grip": [{ "state": { "orientation": told } }] });
+        let wrong = [
+            json!({ "verse_grip": grip(0.0, 0.0) }),
+            json!({ "verse_grip": grip(1e200, 1e300) }),
+            json!({ "verse_grip": grip(f64::NAN, 0.0) }),
+            wrong(json!({ "w": 1.0, "x": 0.0, "y": 0.0 })),
+            wrong(Value::Null),
+            wrong(json!([1, 0, 0, 0])),
+        ];
+        let now = Instant::now();
+        let later = now + Duration::from_millis(70);
+        let mut known = Grip::default();
+        known.take(&both, now);
+        for wrong in &wrong {
+            assert!(orientation(wrong).unwrap().is_err(), "{wrong}");
+            // The last valid one stays, and grows old.
+            let mut grip = known;
+            grip.take(wrong, later);
+            assert_eq!((grip, grip.lost(later)), (known, later - now));
+            let mut grip = Grip::default();
+            grip.take(wrong, now);
+            grip.take(wrong, later);
+            assert_eq!(grip.lost(later), later - now);
+            grip.take(&both, later);
+            assert_eq!(grip.lost(later), Duration::ZERO);
+        }
+        // A device without a grip is not turned, which is no fault.
+        let mut none = Grip::default();
+        none.take(&json!({ "inverse3": [] }), now);
+        assert_eq!(none.lost(later), Duration::ZERO);
     }
 
     #[test]
