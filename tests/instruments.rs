@@ -165,6 +165,51 @@ fn jaws_lift_what_is_between_them_by_friction_and_slip_without_it() {
     assert!(last(&slips).force_on_tool_n[2] > held.force_on_tool_n[2] / 3.0, "{:?}", last(&slips));
 }
 
+/// Jaws close on the plate twice, further than their limit allows, and open in between.
+#[test]
+fn a_summary_tells_each_time_that_jaws_crush_what_they_hold() {
+    let plate = model(DVec3::new(0.04, 0.008, 0.024), 0.004);
+    let down = text_of(DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2));
+    let pose = |at_s: f64, jaw_rad: f64| {
+        format!("{{ at_s = {at_s}, place_m = [0.02, 0.004, 0.016], orientation = {down}, jaw_rad = {jaw_rad} }}")
+    };
+    let poses =
+        [pose(0.01, 0.7), pose(0.2, 0.1), pose(0.3, 0.1), pose(0.4, 0.7), pose(0.5, 0.7), pose(0.7, 0.1)].join(", ");
+    let text = |limit: &str| {
+        format!(
+            "duration_s = 0.8\nsample_every_s = 0.001\n[[instrument]]\n{limit}\n\
+             jaws = {{ length_m = 0.03, radius_m = 0.003, friction = 0.8 }}\nposes = [{poses}]\n"
+        )
+    };
+    let (records, free) = played(&plate, &text(""));
+    let opening_n_m = |record: &Record| record.instruments.first().map_or(0.0, |felt| felt.opening_n_m.unwrap());
+    let most_n_m = records.iter().map(opening_n_m).fold(0.0, f64::max);
+    let limit_n_m = 0.5 * most_n_m;
+    assert!(free.jaw_overloads.is_empty() && free.warnings.is_empty(), "{:?}", free.warnings);
+    let (_, limited) = played(&plate, &text(&format!("jaw_torque_limit_n_m = {limit_n_m:?}")));
+    println!("{:?} {:?}", limited.jaw_overloads, limited.warnings);
+    assert_eq!(limited.final_hash, free.final_hash);
+    // Once for each time that they close: at the first step whose torque is above the limit.
+    let is_above = |from_step: usize| (from_step..).find(|step| opening_n_m(&records[*step]) > limit_n_m);
+    let steps: Vec<_> = limited.jaw_overloads.iter().map(|overload| Some(overload.step as usize)).collect();
+    assert_eq!(steps, [is_above(0), is_above(450)]);
+    for overload in &limited.jaw_overloads {
+        assert_eq!((overload.instrument, overload.first_tool, overload.limit_n_m), (0, 0, limit_n_m));
+        assert_eq!(overload.torque_n_m, opening_n_m(&records[overload.step as usize]));
+    }
+    let [warning] = &limited.warnings[..] else { panic!("{:?}", limited.warnings) };
+    assert!(warning.contains("instrument 0") && warning.contains("2 times"), "{warning}");
+    for (limit, says) in
+        [("0", "above 0"), ("-1", "above 0"), ("101", "at most 100"), ("nan", "finite"), ("\"a\"", "number")]
+    {
+        let refusal = script(&plate, &text(&format!("jaw_torque_limit_n_m = {limit}"))).unwrap_err().to_string();
+        assert!(refusal.contains("jaw_torque_limit_n_m") && refusal.contains(says), "{refusal}");
+    }
+    let shaft = text("jaw_torque_limit_n_m = 0.1").replace("jaws =", "shaft =").replace("jaw_rad = 0.7", "jaw_rad = 0");
+    let refusal = script(&plate, &shaft.replace("jaw_rad = 0.1", "jaw_rad = 0")).unwrap_err().to_string();
+    assert!(refusal.contains("jaw_torque_limit_n_m") && refusal.contains("with jaws"), "{refusal}");
+}
+
 /// A shaft through a port presses and sweeps. Between its poses the script would lead it past the port.
 #[test]
 fn a_shaft_stays_in_its_port_whose_reaction_balances_the_wrench() {

@@ -304,7 +304,7 @@ fn grasper() -> pb::Instrument {
         tip(DVec3::ZERO, InstrumentPart::LowerJaw),
     ];
     let port = Some(Port { place_m: DVec3::new(0.1, 0.1, 1.0), handle_m: 2.0 });
-    instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X, port }, 0)
+    instrument::instrument(&Instrument { tips, hinge_m: -0.03 * DVec3::X, port, jaw_torque_limit_n_m: Some(0.01) }, 0)
 }
 
 fn request_seeds() -> Vec<Vec<u8>> {

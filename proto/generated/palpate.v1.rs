@@ -386,6 +386,10 @@ pub struct Instrument {
     /// Absent: it moves freely.
     #[prost(message, optional, tag = "4")]
     pub port: ::core::option::Option<Port>,
+    /// Torque between its jaws (InstrumentSample.opening_n_m) above which they crush what they hold, N\*m: above 0 and at
+    /// most 100, only with jaws. The stream then gets `jaw_overload`. It changes no force. Absent: no limit.
+    #[prost(double, optional, tag = "5")]
+    pub jaw_torque_limit_n_m: ::core::option::Option<f64>,
 }
 impl ::prost::Name for Instrument {
     const NAME: &'static str = "Instrument";
@@ -994,7 +998,7 @@ impl ::prost::Name for Renew {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TouchResponse {
-    #[prost(oneof = "touch_response::Message", tags = "1, 2, 3, 4, 5")]
+    #[prost(oneof = "touch_response::Message", tags = "1, 2, 3, 4, 5, 6")]
     pub message: ::core::option::Option<touch_response::Message>,
 }
 /// Nested message and enum types in `TouchResponse`.
@@ -1015,6 +1019,9 @@ pub mod touch_response {
         /// A force law that replaces the previous one, or the reason why there is none.
         #[prost(message, tag = "5")]
         ForceLaw(super::ForceLawUpdate),
+        /// The jaws of an instrument of this stream crush what they hold.
+        #[prost(message, tag = "6")]
+        JawOverload(super::JawOverload),
     }
 }
 impl ::prost::Name for TouchResponse {
@@ -1025,6 +1032,33 @@ impl ::prost::Name for TouchResponse {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.TouchResponse".into()
+    }
+}
+/// The torque between the jaws of an instrument exceeds its limit (Instrument.jaw_torque_limit_n_m). Sent before the
+/// first sample of the stream in which it does, and once more only after it has been below 0.8 of the limit. With
+/// fewer samples than steps, what happens between two samples is not seen.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct JawOverload {
+    /// The first tool of the instrument.
+    #[prost(uint32, tag = "1")]
+    pub first_tool: u32,
+    /// As in that sample.
+    #[prost(uint64, tag = "2")]
+    pub step: u64,
+    /// The torque with which the tissue opens the jaws.
+    #[prost(double, tag = "3")]
+    pub torque_n_m: f64,
+    #[prost(double, tag = "4")]
+    pub limit_n_m: f64,
+}
+impl ::prost::Name for JawOverload {
+    const NAME: &'static str = "JawOverload";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.JawOverload".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.JawOverload".into()
     }
 }
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -4,6 +4,7 @@ use glam::DQuat;
 use palpate_haptics::instrument::MAX_TIPS;
 use palpate_haptics::instrument_contact::MAX_CAPSULES;
 use palpate_haptics::instrument_pose::MAX_JAW_RAD;
+use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::HANDLE_M;
 use palpate_haptics::{
     Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, MotionState,
@@ -29,8 +30,9 @@ const MAX_VELOCITY: f64 = 1e3;
 ///
 /// # Errors
 /// Refuses an instrument without tips or with more than [`MAX_TIPS`], a part or a shape that this program does not know, a tip
-/// that grasps or has a spring, a place that is not finite or farther than 10 m from the origin, and a port that is farther than
-/// 1000 m away or has a handle at no possible distance.
+/// that grasps or has a spring, a place that is not finite or farther than 10 m from the origin, a port that is farther than
+/// 1000 m away or has a handle at no possible distance, and a limit of the jaws' torque that is not above 0 and at most 100 N·m, or for
+/// an instrument without jaws.
 pub fn from_instrument(field: &str, message: &pb::Instrument) -> Result<Instrument> {
     let near = |field: &str, place_m: Option<&pb::Vector3>| {
         let place_m = from_vector(place_m);
@@ -61,11 +63,21 @@ pub fn from_instrument(field: &str, message: &pb::Instrument) -> Result<Instrume
         }
         Ok(InstrumentTip { offset_m: near(&format!("{field}.offset_m"), message.offset_m.as_ref())?, tip, part })
     };
-    Ok(Instrument {
+    let instrument = Instrument {
         tips: message.tips.iter().enumerate().map(tip_of).collect::<Result<_>>()?,
         hinge_m: near(&format!("{field}.hinge_m"), message.hinge_m.as_ref())?,
         port: message.port.as_ref().map(|message| from_port(&format!("{field}.port"), message)).transpose()?,
-    })
+        jaw_torque_limit_n_m: message.jaw_torque_limit_n_m,
+    };
+    if let Some(limit_n_m) = instrument.jaw_torque_limit_n_m {
+        let field = format!("{field}.jaw_torque_limit_n_m");
+        if !instrument.has_jaws() {
+            return Err(Refusal::new(Reason::WrongKind, field, "is for an instrument with jaws"));
+        }
+        let range = format!("above 0 and at most {MAX_JAW_TORQUE_LIMIT_N_M}");
+        number(&field, limit_n_m, &range, |v| v > 0.0 && v <= MAX_JAW_TORQUE_LIMIT_N_M)?;
+    }
+    Ok(instrument)
 }
 
 fn from_port(field: &str, message: &pb::Port) -> Result<Port> {
@@ -93,6 +105,7 @@ pub fn instrument(instrument: &Instrument, first_tool: u32) -> pb::Instrument {
         tips: instrument.tips.iter().map(tip_of).collect(),
         hinge_m: vector(instrument.hinge_m),
         port: instrument.port.map(|port| pb::Port { position_m: vector(port.place_m), handle_m: port.handle_m }),
+        jaw_torque_limit_n_m: instrument.jaw_torque_limit_n_m,
     }
 }
 

@@ -41,6 +41,12 @@ fn instrument_sample(sample: &InstrumentSample) -> pb::InstrumentSample {
     }
 }
 
+/// Returns the message that the jaws of an instrument exceed their limit since a step, if they do.
+fn jaw_overload(sample: &InstrumentSample, step: u64) -> Option<pb::JawOverload> {
+    let (limit_n_m, torque_n_m) = (sample.exceeded_n_m?, sample.opening_n_m?);
+    Some(pb::JawOverload { first_tool: sample.first_tool, step, torque_n_m, limit_n_m })
+}
+
 /// The instruments of the streams of a session.
 type StreamsOfSession = Arc<Mutex<Vec<Weak<Mutex<Vec<LedInstrument>>>>>>;
 
@@ -77,10 +83,11 @@ pub(super) struct JoinedInstruments {
 }
 
 impl JoinedInstruments {
-    /// Adds to a message what the instruments of the stream felt at a sample, and where the others are then, if it is to tell.
-    pub(super) fn add_to(&self, message: &mut pb::Sample, sample: &Sample) {
+    /// Adds to a message what the instruments of the stream felt at a sample, and where the others are then, if it is to tell. Returns
+    /// the instruments whose jaws exceed their limit since this sample.
+    pub(super) fn add_to(&self, message: &mut pb::Sample, sample: &Sample) -> Vec<pb::JawOverload> {
         if !self.tells_of_others && lock(&self.own).is_empty() {
-            return;
+            return Vec::new();
         }
         let streams: Vec<Instruments> = lock(&self.streams).iter().filter_map(Weak::upgrade).collect();
         let now_s = sample.simulation_time_s;
@@ -99,6 +106,8 @@ impl JoinedInstruments {
         own.iter_mut().for_each(|instrument| instrument.see(sample));
         all.extend(own.iter().filter_map(|instrument| instrument.seen(now_s)));
         let felt = own.iter_mut().filter_map(|instrument| instrument.sample(sample, all.iter().copied()));
-        message.instruments = felt.map(|felt| instrument_sample(&felt)).collect();
+        let felt: Vec<InstrumentSample> = felt.collect();
+        message.instruments = felt.iter().map(instrument_sample).collect();
+        felt.iter().filter_map(|felt| jaw_overload(felt, sample.step)).collect()
     }
 }

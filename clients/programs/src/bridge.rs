@@ -7,6 +7,7 @@ use palpate_client::HapticDevice;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run, two_hands};
 use palpate_client::devices::{self, DeviceKind, Placed, Placement};
 use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::HANDLE_M;
 use palpate_haptics::{Instrument, LimitCause, Port, RenderingState, Tip, TipShape};
 use palpate_refusal::printable::printable_json;
@@ -76,6 +77,9 @@ pub(crate) struct BridgeArguments {
     /// With --port-m: distance from the tip of the instrument to its handle, m
     #[arg(long, value_name = "M", default_value_t = palpate_haptics::port::DEFAULT_HANDLE_M, requires = "port_m")]
     handle_m: f64,
+    /// Warn and count when the torque between the jaws of the instrument exceeds this, N·m: then they crush what they hold
+    #[arg(long, value_name = "N_M", requires = "jaws_m")]
+    jaw_torque_limit_n_m: Option<f64>,
     /// The simulated hand that holds a simulated device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
@@ -141,6 +145,10 @@ fn instrument(arguments: &BridgeArguments, tip: Tip) -> Result<Option<Instrument
         return Err(ClientFailure::Refused(format!("the instrument: {message}")));
     }
     instrument.port = arguments.port_m.map(|place_m| Port { place_m, handle_m });
+    let range = format!("above 0 and at most {MAX_JAW_TORQUE_LIMIT_N_M}");
+    let limit =
+        |torque_n_m| number("--jaw-torque-limit-n-m", torque_n_m, &range, |v| v > 0.0 && v <= MAX_JAW_TORQUE_LIMIT_N_M);
+    instrument.jaw_torque_limit_n_m = arguments.jaw_torque_limit_n_m.map(limit).transpose()?;
     Ok(Some(instrument))
 }
 
@@ -246,7 +254,7 @@ fn as_json(served: &BridgeReport, session_id: Option<&str>) -> serde_json::Value
         "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
         "tick_lateness_us": { "p50": p50_us, "p99": p99_us, "max": max_us },
         "predicted_ticks": served.predicted_ticks, "largest_force_n": served.most_force_n, "largest_torque_n_m": served.most_torque_n_m,
-        "largest_displacement_m": traffic.deepest_m, "session_id": session_id,
+        "largest_displacement_m": traffic.deepest_m, "jaw_overloads": traffic.jaw_overloads, "session_id": session_id,
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
@@ -260,7 +268,8 @@ fn as_json(served: &BridgeReport, session_id: Option<&str>) -> serde_json::Value
 
 /// The results for people.
 fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
-    let Traffic { connections, samples, bytes, refused, failed, poses, carried, deepest_m } = served.traffic;
+    let Traffic { connections, samples, bytes, refused, jaw_overloads, failed, poses, carried, deepest_m } =
+        served.traffic;
     #[allow(clippy::cast_precision_loss)]
     let kilobytes = bytes as f64 / 1e3;
     let [p50_us, p99_us, max_us] = served.tick_lateness_s.map(|late_s| 1e6 * late_s);
@@ -281,6 +290,9 @@ fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
     ];
     if served.most_torque_n_m > 0.0 {
         rows.push(("largest torque", table::with_unit(served.most_torque_n_m, "N·m")));
+    }
+    if jaw_overloads > 0 {
+        rows.push(("jaws above their limit", format!("{jaw_overloads} times")));
     }
     if let Some(envelope) = &served.envelope {
         let is_on = envelope.state() == RenderingState::Enabled;

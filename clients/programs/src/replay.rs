@@ -411,7 +411,7 @@ async fn play(
                     measured.rejected += u64::from(rejection.reason != Reason::Recovered.as_str());
                     progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
-                Heard::Opened(_) | Heard::ForceLaw(_) => {}
+                Heard::Opened(_) | Heard::ForceLaw(_) | Heard::JawOverload(_) => {}
             },
             message = next(records.message(), heard), if records_left > 0 => {
                 let message = message?;
@@ -459,6 +459,7 @@ async fn play(
         audited_error: None,
         corrections: Vec::new(),
         recoveries,
+        jaw_overloads: Vec::new(),
         warnings: far_warning(measured.largest_displacement_m, scene.shape()).into_iter().collect(),
         largest_displacement_m: measured.largest_displacement_m,
         peak_reaction_n: measured.peak_reaction_n,

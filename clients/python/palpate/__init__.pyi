@@ -156,8 +156,8 @@ class Tip:
 class Instrument:
     """An instrument that a device leads by its place and orientation: jaws that end at its place, and a shaft behind them, each
     a row of tips of a length. It points along x of its frame; the jaws open in y. With `port_m` the shaft slides through that
-    place, as through a trocar, and the handle is `handle_m` from the place. Raises Refused if it has neither jaws nor a
-    shaft."""
+    place, as through a trocar, and the handle is `handle_m` from the place. `Touched.jaw_overloads` counts how often the torque
+    between the jaws exceeded `jaw_torque_limit_n_m`. Raises Refused if it has neither jaws nor a shaft."""
 
     def __init__(
         self,
@@ -167,6 +167,7 @@ class Instrument:
         tip: Optional[Tip] = None,
         port_m: Optional[Vector] = None,
         handle_m: float = 0.33,
+        jaw_torque_limit_n_m: Optional[float] = None,
     ) -> None: ...
     @property
     def tips(self) -> int:

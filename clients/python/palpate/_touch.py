@@ -50,7 +50,8 @@ class Touched:
     force on the hand that the device was given, z up. `time_s` is counted from the first tick; `enabled` says whether forces were
     enabled. `ages_s` is the age of the newest data of the tissue, for ticks since the first data. `limits` counts the ticks in which
     each limit of the safety envelope acted, `energy_j` is the energy that the device gave to the hand, and `lost` is the reason why
-    there was no connection at the end, or None. `largest_torque_n_m` is 0 without an instrument.
+    there was no connection at the end, or None. `largest_torque_n_m` is 0 without an instrument. `jaw_overloads` counts how often the
+    torque between its jaws exceeded their limit.
     """
 
     time_s: np.ndarray
@@ -72,6 +73,7 @@ class Touched:
     energy_j: float
     lost: Optional[str]
     largest_torque_n_m: float = 0.0
+    jaw_overloads: int = 0
 
 
 @dataclasses.dataclass(eq=False)

@@ -2,6 +2,7 @@
 
 use palpate_haptics::Port;
 use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use pyo3::prelude::*;
 
@@ -11,8 +12,8 @@ use crate::tip::Tip;
 
 /// An instrument that a device leads by its place and orientation: jaws that end at its place, and a shaft behind them, each
 /// a row of tips of a length. It points along x of its frame; the jaws open in y. With `port_m` the shaft slides through that
-/// place, as through a trocar, and the handle is `handle_m` from the place. Raises Refused if it has neither jaws nor a
-/// shaft.
+/// place, as through a trocar, and the handle is `handle_m` from the place. `Touched.jaw_overloads` counts how often the torque
+/// between the jaws exceeded `jaw_torque_limit_n_m`. Raises Refused if it has neither jaws nor a shaft.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Instrument(pub(crate) palpate_haptics::Instrument);
@@ -20,13 +21,14 @@ pub(crate) struct Instrument(pub(crate) palpate_haptics::Instrument);
 #[pymethods]
 impl Instrument {
     #[new]
-    #[pyo3(signature = (*, jaws_m=None, shaft_m=None, tip=None, port_m=None, handle_m=DEFAULT_HANDLE_M))]
+    #[pyo3(signature = (*, jaws_m=None, shaft_m=None, tip=None, port_m=None, handle_m=DEFAULT_HANDLE_M, jaw_torque_limit_n_m=None))]
     fn new(
         jaws_m: Option<f64>,
         shaft_m: Option<f64>,
         tip: Option<Tip>,
         port_m: Option<&Bound<'_, PyAny>>,
         handle_m: f64,
+        jaw_torque_limit_n_m: Option<f64>,
     ) -> PyResult<Self> {
         let tip = tip.map(|tip| tip.0).unwrap_or_default();
         if tip.radius_m.is_nan() || tip.radius_m <= 0.0 {
@@ -52,6 +54,16 @@ impl Instrument {
         }
         let place_m = port_m.map(|port_m| vector("port_m", port_m)).transpose()?;
         instrument.port = place_m.map(|place_m| Port { place_m, handle_m });
+        if let Some(limit_n_m) = jaw_torque_limit_n_m {
+            if jaws.is_none() {
+                return Err(wrong("jaw_torque_limit_n_m", "is for an instrument with jaws"));
+            }
+            if !(limit_n_m > 0.0 && limit_n_m <= MAX_JAW_TORQUE_LIMIT_N_M) {
+                let message = format!("must be above 0 and at most {MAX_JAW_TORQUE_LIMIT_N_M}");
+                return Err(wrong("jaw_torque_limit_n_m", message));
+            }
+        }
+        instrument.jaw_torque_limit_n_m = jaw_torque_limit_n_m;
         Ok(Instrument(instrument))
     }
 

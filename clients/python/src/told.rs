@@ -153,6 +153,7 @@ impl<'py> IntoPyObject<'py> for Touched {
         found.set_item("samples", traffic.samples)?;
         found.set_item("poses", traffic.poses)?;
         found.set_item("refused", traffic.refused)?;
+        found.set_item("jaw_overloads", traffic.jaw_overloads)?;
         found.set_item("datagrams_up", traffic.carried.sent)?;
         found.set_item("datagrams_down", traffic.carried.came)?;
         let limits = PyDict::new(py);

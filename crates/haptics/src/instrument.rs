@@ -71,6 +71,9 @@ pub struct Instrument {
     pub hinge_m: DVec3,
     /// The port through which its shaft slides; `None`: it moves freely.
     pub port: Option<Port>,
+    /// The torque between its jaws above which they crush what they hold, N·m ([`crate::JawTorqueMonitor`]); `None`: they have no limit.
+    /// It changes no force.
+    pub jaw_torque_limit_n_m: Option<f64>,
 }
 
 impl Instrument {

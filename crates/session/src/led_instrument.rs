@@ -7,7 +7,8 @@ use std::collections::VecDeque;
 
 use palpate_haptics::pose_playback::{EXTRAPOLATE_S, RELEASE_S};
 use palpate_haptics::{
-    ContactLoad, Instrument, InstrumentContact, InstrumentPose, InstrumentVelocity, OtherInstrument, PortLoad, Wrench,
+    ContactLoad, Instrument, InstrumentContact, InstrumentPose, InstrumentVelocity, JawTorqueMonitor, OtherInstrument,
+    PortLoad, Wrench,
 };
 
 use super::Sample;
@@ -40,6 +41,8 @@ pub struct LedInstrument {
     first_tool: u32,
     poses: VecDeque<AcceptedPose>,
     contact: InstrumentContact,
+    /// `None`: its jaws have no limit.
+    jaws: Option<JawTorqueMonitor>,
     /// Where it was at the newest sample, for others, and for the next velocity; `None` if it was nowhere.
     seen: Option<(OtherInstrument, SeenPose)>,
 }
@@ -70,6 +73,8 @@ pub struct InstrumentSample {
     pub wrench: Wrench,
     /// Torque with which the tissue opens the jaws, N·m; `None` without jaws.
     pub opening_n_m: Option<f64>,
+    /// The limit of that torque, N·m, if it exceeds it now and did not before ([`JawTorqueMonitor`]).
+    pub exceeded_n_m: Option<f64>,
     /// What its port and the hand exert; `None` without a port.
     pub port_load: Option<PortLoad>,
     /// The instruments that it overlaps with, by the tool of their first tip, and what they exert.
@@ -79,8 +84,8 @@ pub struct InstrumentSample {
 impl LedInstrument {
     /// Creates an instrument without a pose. Its tips are the tools from `first_tool` on.
     pub fn new(instrument: Instrument, first_tool: u32) -> Self {
-        let contact = InstrumentContact::new(&instrument);
-        LedInstrument { instrument, first_tool, poses: VecDeque::new(), contact, seen: None }
+        let (contact, jaws) = (InstrumentContact::new(&instrument), JawTorqueMonitor::of(&instrument));
+        LedInstrument { instrument, first_tool, poses: VecDeque::new(), contact, jaws, seen: None }
     }
 
     /// Returns the instrument.
@@ -169,6 +174,7 @@ impl LedInstrument {
     pub fn released(&mut self) {
         self.poses.clear();
         self.contact.forget();
+        self.jaws.iter_mut().for_each(JawTorqueMonitor::reset);
         self.seen = None;
     }
 
@@ -203,7 +209,7 @@ impl LedInstrument {
         let forces_n: Vec<_> =
             tips.filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n))).collect();
         let forces_n = || forces_n.iter().copied();
-        let LedInstrument { instrument, first_tool, contact, .. } = self;
+        let LedInstrument { instrument, first_tool, contact, jaws, .. } = self;
         contact.begin();
         let others = others.into_iter().filter(|other| other.first_tool != *first_tool);
         let touching = others.filter_map(|other| {
@@ -213,12 +219,15 @@ impl LedInstrument {
         let mut contacts: Vec<_> = touching.collect();
         contacts.sort_by_key(|(tool, _)| *tool);
         let wrench = instrument.wrench(&pose, forces_n());
+        let opening_n_m = instrument.has_jaws().then(|| instrument.opening_n_m(&pose, forces_n()));
+        let exceeded = |jaws: &mut JawTorqueMonitor| jaws.exceeds(opening_n_m?).then(|| jaws.limit_n_m());
         Some(InstrumentSample {
             first_tool: *first_tool,
             client_time_s,
             pose,
             wrench,
-            opening_n_m: instrument.has_jaws().then(|| instrument.opening_n_m(&pose, forces_n())),
+            opening_n_m,
+            exceeded_n_m: jaws.as_mut().and_then(exceeded),
             port_load: instrument.port_load(&pose, &wrench),
             contacts,
         })

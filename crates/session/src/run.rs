@@ -3,17 +3,21 @@
 use std::io::Write;
 use std::sync::Arc;
 
+use super::Session;
 use super::audit::{Twin, Windows};
 use super::simulation::{Simulation, SimulationFailure};
-use palpate_haptics::Tip;
+use palpate_haptics::{JawTorqueMonitor, Tip};
+use palpate_refusal::legible;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
 use palpate_tissue::scene::profile::PoseProfile;
-use palpate_tissue::scene::record::{Line, Record, Run, Summary, TopologyRecord, far_warning, write_line};
-use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::record::{
+    JawOverload, Line, MAX_JAW_OVERLOADS, Record, Run, Summary, TopologyRecord, far_warning, write_line,
+};
+use palpate_tissue::scene::script::{Script, forces_n};
 use palpate_tissue::{Model, StageTimes, Tissue};
 
 /// Returns the first line of a run: the names of scene and script, the stepping of the model (integrator, substeps
@@ -108,7 +112,7 @@ pub fn run_with(
     let mut windows = (twin.is_some() && model.scene.stepping.correct).then(Windows::default);
     let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
     let (mut largest_displacement_m, mut peak_reaction_n, mut curves) = (0.0_f64, 0.0_f64, Curves::of(model.shape()));
-    let (tip, mut on_fixed) = (script.first_tip(), None);
+    let (tip, mut on_fixed, mut jaws) = (script.first_tip(), None, WatchedJaws::of(script));
     for step in 0..script.steps {
         // The summary's clock stops during everything other than the session's own stepping.
         stepping_s += clock_s() - resumed_s;
@@ -129,6 +133,11 @@ pub fn run_with(
         }
         resumed_s = clock_s();
         session.advance(due, |session| {
+            if jaws.has_any() {
+                stepping_s += clock_s() - resumed_s;
+                jaws.look(script, session);
+                resumed_s = clock_s();
+            }
             if session.step_count().is_multiple_of(script.sample_every) {
                 stepping_s += clock_s() - resumed_s;
                 if written.is_ok() {
@@ -166,12 +175,15 @@ pub fn run_with(
              force is not that of free tissue"
         )
     });
-    let warnings = far_warning(largest_displacement_m, model.shape()).into_iter().chain(on_fixed).collect();
+    let crushed = jaws.warning(model.scene.stepping.rate_hz);
+    let warnings =
+        far_warning(largest_displacement_m, model.shape()).into_iter().chain(on_fixed).chain(crushed).collect();
     let summary = Summary {
         audited_error,
         mesh_error_estimate: MeshErrorEstimate::of(model, disc(model, script)).map(|error| error.relative),
         corrections,
         recoveries: session.recoveries().list(),
+        jaw_overloads: jaws.overloads,
         warnings,
         largest_displacement_m,
         peak_reaction_n,
@@ -180,6 +192,66 @@ pub fn run_with(
     };
     tell(RunEvent::Summary(&summary))?;
     Ok(summary)
+}
+
+/// The instruments of a script whose jaws have a limit, and when they exceeded it.
+struct WatchedJaws {
+    /// By the number of the instrument.
+    monitors: Vec<(usize, JawTorqueMonitor)>,
+    overloads: Vec<JawOverload>,
+    /// How often they did; `overloads` has the first of these.
+    count: u64,
+}
+
+impl WatchedJaws {
+    fn of(script: &Script) -> Self {
+        let numbered = script.instruments.iter().enumerate();
+        let monitors = numbered
+            .filter_map(|(number, profile)| Some((number, JawTorqueMonitor::of(&profile.instrument)?)))
+            .collect();
+        WatchedJaws { monitors, overloads: Vec::new(), count: 0 }
+    }
+
+    fn has_any(&self) -> bool {
+        !self.monitors.is_empty()
+    }
+
+    /// Takes the torques at the end of a step. An instrument that is not there exerts none.
+    #[allow(clippy::cast_possible_truncation)]
+    fn look(&mut self, script: &Script, session: &Session) {
+        let (tools, time_s) = (session.tool_records(), session.time_s());
+        for (number, monitor) in &mut self.monitors {
+            let profile = &script.instruments[*number];
+            let opening_n_m =
+                profile.at(time_s).map_or(0.0, |pose| profile.instrument.opening_n_m(&pose, forces_n(profile, &tools)));
+            if monitor.exceeds(opening_n_m) {
+                self.count += 1;
+                if self.overloads.len() < MAX_JAW_OVERLOADS {
+                    self.overloads.push(JawOverload {
+                        step: session.step_count(),
+                        instrument: *number as u32,
+                        first_tool: profile.first_tool as u32,
+                        torque_n_m: opening_n_m,
+                        limit_n_m: monitor.limit_n_m(),
+                    });
+                }
+            }
+        }
+    }
+
+    /// Returns a warning about the first time; `None` if there is none.
+    #[allow(clippy::cast_precision_loss)]
+    fn warning(&self, rate_hz: f64) -> Option<String> {
+        let JawOverload { step, instrument, first_tool, torque_n_m, limit_n_m } = self.overloads.first()?;
+        let times = if self.count == 1 { "once".to_owned() } else { format!("{} times", self.count) };
+        Some(format!(
+            "the jaws of instrument {instrument} (tool {first_tool}) crush what they hold: at {:.3} s the torque between them was {} \
+             N·m, above its limit of {} N·m; all jaws exceeded their limits {times}",
+            *step as f64 / rate_hz,
+            legible(*torque_n_m),
+            legible(*limit_n_m)
+        ))
+    }
 }
 
 /// Returns the disc of the first tip of a script, where it is first; without a tip that of a fingertip in the middle.
@@ -233,6 +305,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         mesh_error_estimate: None,
         corrections: Vec::new(),
         recoveries: Vec::new(),
+        jaw_overloads: Vec::new(),
         warnings: Vec::new(),
         largest_displacement_m: 0.0,
         peak_reaction_n: 0.0,

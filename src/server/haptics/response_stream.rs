@@ -111,7 +111,8 @@ impl ResponseStream {
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
             let mut sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
-            self.instruments.add_to(&mut sample, &paced.sample);
+            let overloads = self.instruments.add_to(&mut sample, &paced.sample);
+            self.ready.extend(overloads.into_iter().map(Message::JawOverload));
             // The stream has a heartbeat of its own, which shows a client that it still works.
             let (now, by_datagram) = (now_ns(), self.channel.send(&sample));
             if !by_datagram || now.saturating_sub(self.streamed_ns) >= HEARTBEAT_NS {

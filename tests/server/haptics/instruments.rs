@@ -2,10 +2,13 @@
 
 use crate::common::server::{TestServer, TestTouch, open, told};
 use glam::{DQuat, DVec3};
-use palpate_haptics::{Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, Port, Tip};
+use palpate_haptics::{
+    Instrument, InstrumentPart, InstrumentPose, InstrumentTip, InstrumentVelocity, JawTorqueMonitor, Port, Tip,
+};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::pb::command::Action;
 use palpate_proto::{instrument, pb, touch};
+use pb::touch_response::Message as Heard;
 
 /// A shaft of 20 mm, and jaws of 8 mm: 5 + 3 + 3 tips.
 fn grasper() -> Instrument {
@@ -111,6 +114,57 @@ async fn one_pose_moves_all_tips_and_samples_have_the_wrench() {
     start(&server, &together, STEPS + 1).await;
     let after = as_one.sample_with(|sample| sample.step == STEPS + 1).await;
     assert_eq!(after.instruments, []);
+}
+
+/// The jaws close on `liver` and drag it. Half of the largest torque that a first stream was told of is the limit of a second one.
+#[tokio::test]
+async fn a_stream_is_told_once_that_jaws_crush_what_they_hold() {
+    const STEPS: u64 = 300;
+    let server = TestServer::start(&[]);
+    let mut limit_n_m = None;
+    for round in 0..2 {
+        let session = liver(&server, true).await;
+        let grasper = Instrument { jaw_torque_limit_n_m: limit_n_m, ..grasper() };
+        let instruments = vec![instrument::instrument(&grasper, FIRST)];
+        let mut touch =
+            TestTouch::open(&server, pb::TouchOpen { instruments, ..open(&session, &tools()) }).await.unwrap();
+        for step in 0..STEPS {
+            touch.command(command(step, instrument::pose(&pose_at(step + 1)))).await;
+        }
+        touch.settle().await;
+        start(&server, &session, STEPS).await;
+        let (mut most_n_m, mut monitor, mut told) = (0.0_f64, JawTorqueMonitor::of(&grasper), None);
+        let mut overloads = 0;
+        loop {
+            match touch.hear().await.unwrap().unwrap() {
+                Heard::JawOverload(overload) => {
+                    assert!(told.is_none(), "{told:?}");
+                    told = Some(overload);
+                }
+                Heard::Sample(sample) => {
+                    let opening_n_m = sample.instruments.first().map_or(0.0, |felt| felt.opening_n_m.unwrap());
+                    most_n_m = most_n_m.max(opening_n_m);
+                    // It comes before the sample in which the torque is above the limit.
+                    let exceeds = monitor.as_mut().is_some_and(|monitor| monitor.exceeds(opening_n_m));
+                    let expected = exceeds.then(|| pb::JawOverload {
+                        first_tool: FIRST,
+                        step: sample.step,
+                        torque_n_m: opening_n_m,
+                        limit_n_m: limit_n_m.unwrap(),
+                    });
+                    assert_eq!(told.take(), expected);
+                    overloads += u32::from(exceeds);
+                    if sample.step == STEPS {
+                        break;
+                    }
+                }
+                _ => {}
+            }
+        }
+        println!("{most_n_m} N·m, {overloads} times");
+        assert!(most_n_m > 1e-6 && (overloads > 0) == (round == 1), "{most_n_m} {overloads}");
+        limit_n_m = Some(0.5 * most_n_m);
+    }
 }
 
 /// Poses by the client's time are played back, also with velocities: the wrench is told about where the instrument is then.
@@ -241,6 +295,24 @@ async fn what_is_wrong_with_an_instrument_is_named() {
         (with(&|instrument| instrument.first_tool = u32::MAX - 2), "OUT_OF_RANGE", "instruments[0].first_tool"),
         (twice, "OUT_OF_RANGE", "instruments[1].first_tool"),
         (
+            with(&|instrument| instrument.jaw_torque_limit_n_m = Some(0.0)),
+            "OUT_OF_RANGE",
+            "instruments[0].jaw_torque_limit_n_m",
+        ),
+        (
+            with(&|instrument| instrument.jaw_torque_limit_n_m = Some(f64::NAN)),
+            "NOT_FINITE",
+            "instruments[0].jaw_torque_limit_n_m",
+        ),
+        (
+            with(&|instrument| {
+                instrument.tips.iter_mut().for_each(|tip| tip.part = 1);
+                instrument.jaw_torque_limit_n_m = Some(0.1);
+            }),
+            "WRONG_KIND",
+            "instruments[0].jaw_torque_limit_n_m",
+        ),
+        (
             with(&|instrument| instrument.port = Some(port_at(DVec3::Z, 3.0))),
             "OUT_OF_RANGE",
             "instruments[0].port.handle_m",
@@ -297,7 +369,8 @@ async fn what_is_wrong_with_an_instrument_is_named() {
 fn an_instrument_is_read_as_it_was_written() {
     let told = InstrumentTip { offset_m: 0.02 * DVec3::Y, tip: Tip::default(), part: InstrumentPart::Body };
     let port = Some(Port { place_m: DVec3::new(0.04, 0.04, 0.2), handle_m: 0.3 });
-    let grasper = Instrument { tips: [grasper().tips, vec![told]].concat(), port, ..grasper() };
+    let tips = [grasper().tips, vec![told]].concat();
+    let grasper = Instrument { tips, port, jaw_torque_limit_n_m: Some(0.02), ..grasper() };
     assert_eq!(instrument::from_instrument("", &instrument::instrument(&grasper, 5)).unwrap(), grasper);
     let (pose, velocity) = instrument::from_pose(&instrument::pose(&pose_at(100)), &grasper).unwrap();
     assert!(pose.orientation.angle_between(pose_at(100).orientation) < 1e-7 && velocity.is_none());

@@ -62,6 +62,8 @@ pub struct Traffic {
     pub bytes: u64,
     /// Number of commands that the server refused.
     pub refused: u64,
+    /// How often the jaws of the instrument exceeded their limit ([`palpate_haptics::Instrument::jaw_torque_limit_n_m`]).
+    pub jaw_overloads: u64,
     /// Number of failed attempts to connect, and of connections that broke. Moves to a server that a refusal named do
     /// not count.
     pub failed: u64,
@@ -418,6 +420,14 @@ async fn connect(
                         }
                     }
                     Heard::Renewed(renewed) => renewed.datagrams.iter().for_each(|offer| datagrams.take_offer(offer)),
+                    Heard::JawOverload(overload) => {
+                        shared.inbound().traffic.jaw_overloads += 1;
+                        let pb::JawOverload { first_tool, step, torque_n_m, limit_n_m } = overload;
+                        warn(&format!(
+                            "the jaws of the instrument with tool {first_tool} crush what they hold: at step {step} the torque \
+                             between them was {torque_n_m:.3e} N·m, above its limit of {limit_n_m:.3e} N·m"
+                        ));
+                    }
                     Heard::Opened(_) => {}
                 }
             }

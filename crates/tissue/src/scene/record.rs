@@ -219,6 +219,10 @@ pub struct Summary {
     /// The newest recoveries, by ascending step; not written if there were none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub recoveries: Vec<Recovery>,
+    /// When jaws exceeded their limit of torque, by ascending step: the first [`MAX_JAW_OVERLOADS`]; not written if they never did. Of
+    /// a replay always empty.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub jaw_overloads: Vec<JawOverload>,
     /// Warnings for the user. Not written.
     #[serde(skip)]
     pub warnings: Vec<String>,
@@ -249,6 +253,25 @@ pub struct TopologyRecord {
     pub severed: usize,
     /// Number of parts of the tissue; 1 for one that is whole.
     pub pieces: usize,
+}
+
+/// Largest number of [`Summary::jaw_overloads`].
+pub const MAX_JAW_OVERLOADS: usize = 100;
+
+/// The jaws of an instrument crush what they hold: the torque between them exceeds the script's limit
+/// ([`JawTorqueMonitor`](palpate_haptics::JawTorqueMonitor)).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct JawOverload {
+    /// The number of steps at whose end it did.
+    pub step: u64,
+    /// The instrument's number in the script, from 0.
+    pub instrument: u32,
+    /// The tool of its first tip.
+    pub first_tool: u32,
+    /// The torque with which the tissue opens the jaws, N·m.
+    pub torque_n_m: f64,
+    /// The limit, N·m.
+    pub limit_n_m: f64,
 }
 
 /// The time that a stage of the steps has taken.

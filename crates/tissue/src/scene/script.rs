@@ -29,6 +29,13 @@ pub const BUILT_IN: [(&str, &str); 9] = [
 /// Distance from the tissue at rest from which on a tip of an instrument is not led, divided by the longest side of the tissue.
 const FAR_OF_SIDE: f64 = 0.25;
 
+/// Returns the forces of the tissue on the tips of an instrument, by their numbers, N, from the records of the tools.
+pub fn forces_n(profile: &InstrumentProfile, tools: &[ToolRecord]) -> impl Iterator<Item = (usize, DVec3)> {
+    let tip_of = |tool: &ToolRecord| (tool.tool as usize).checked_sub(profile.first_tool);
+    let tips = tools.iter().filter_map(move |tool| Some((tip_of(tool)?, tool.force_on_tool_n.into())));
+    tips.filter(|(tip, _)| *tip < profile.instrument.tips.len())
+}
+
 /// Returns whether the tip of an instrument at a place is led: it is at most a quarter of the tissue's longest side from the
 /// tissue at rest. Farther away it would cost time and feel nothing.
 pub fn is_led(shape: &dyn RestShape, place_m: DVec3, radius_m: f64) -> bool {
@@ -127,12 +134,9 @@ impl Script {
     /// Returns the records of the instruments that are there at a time, s, from those of the tools.
     pub fn instrument_records(&self, time_s: f64, tools: &[ToolRecord]) -> Vec<InstrumentRecord> {
         let of = |(number, profile): (usize, &Arc<InstrumentProfile>)| {
-            let InstrumentProfile { instrument, first_tool, .. } = &**profile;
+            let instrument = &profile.instrument;
             let pose = profile.at(time_s)?;
-            let tip_of = |tool: &ToolRecord| {
-                (tool.tool as usize).checked_sub(*first_tool).filter(|tip| *tip < instrument.tips.len())
-            };
-            let forces_n = || tools.iter().filter_map(|tool| Some((tip_of(tool)?, tool.force_on_tool_n.into())));
+            let forces_n = || forces_n(profile, tools);
             let wrench = instrument.wrench(&pose, forces_n());
             let of_jaws = |value: f64| instrument.has_jaws().then_some(value + 0.0);
             let array = |v: DVec3| (v + DVec3::ZERO).to_array();

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glam::{DQuat, DVec2, DVec3};
 use palpate_haptics::instrument::MAX_TIPS;
 use palpate_haptics::instrument_pose::MAX_JAW_RAD;
+use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Port, Tip, TipShape};
 
@@ -479,7 +480,8 @@ impl Binding<'_> {
     /// Reads an instrument, whose first tip is tool `first_tool`.
     fn instrument(&mut self, item: &Item<'_>, first_tool: usize) -> Result<InstrumentProfile> {
         item.table(|fields| {
-            let instrument = Instrument { port: self.port(fields)?, ..self.tips(item, fields)? };
+            let mut instrument = Instrument { port: self.port(fields)?, ..self.tips(item, fields)? };
+            instrument.jaw_torque_limit_n_m = jaw_torque_limit_n_m(fields, &instrument)?;
             let list = fields.required("poses")?;
             let mut poses: Vec<(f64, InstrumentPose)> = Vec::new();
             for entry in list.list()? {
@@ -609,6 +611,17 @@ impl Binding<'_> {
         let until_s = until(fields, list, poses.first().map(|pose| pose.0))?;
         Ok(PoseProfile { tip, poses, until_s, mounted: None })
     }
+}
+
+/// Reads the limit of the torque between the jaws of an instrument.
+fn jaw_torque_limit_n_m(fields: &mut Fields<'_>, instrument: &Instrument) -> Result<Option<f64>> {
+    const KEY: &str = "jaw_torque_limit_n_m";
+    let Some(limit_n_m) = fields.number(KEY)? else { return Ok(None) };
+    if !instrument.has_jaws() {
+        return Err(fields.refuse(Reason::WrongKind, KEY, "is for an instrument with jaws"));
+    }
+    let range = format!("above 0 and at most {MAX_JAW_TORQUE_LIMIT_N_M}");
+    number(&fields.path(KEY), limit_n_m, &range, |v| v > 0.0 && v <= MAX_JAW_TORQUE_LIMIT_N_M).map(Some)
 }
 
 /// A table `[[tool]]`.
