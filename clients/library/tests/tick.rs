@@ -94,7 +94,7 @@ impl Predictor for SpringCopy {
         let place_m = pose.place_m;
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
         let wrench = Wrench::of_force(self.0 * (-place_m.z).max(0.0) * DVec3::Z);
-        Some(Predicted { wrench, contact_state, own_work_j: 0.0 })
+        Some(Predicted { wrench, contact_state, own_work_j: 0.0, others_work_j: 0.0 })
     }
 }
 

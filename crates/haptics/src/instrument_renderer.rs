@@ -349,7 +349,12 @@ mod tests {
         fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
             let wrench = wrench(pose, self.factor);
             let contact_state = if wrench == Wrench::default() { ContactState::Free } else { ContactState::Sticking };
-            (!self.is_off.load(Ordering::Relaxed)).then_some(Predicted { wrench, contact_state, own_work_j: 0.0 })
+            (!self.is_off.load(Ordering::Relaxed)).then_some(Predicted {
+                wrench,
+                contact_state,
+                own_work_j: 0.0,
+                others_work_j: 0.0,
+            })
         }
     }
 

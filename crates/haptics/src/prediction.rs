@@ -15,9 +15,10 @@
 //! **Other tools.** The copy has those that the client knows ([`OtherTool`]): its own second tool at once, and those of
 //! other clients by samples, from which they go on at constant velocity. At t₀ the server had another client's tool where
 //! that is half a round trip after the copy had it there, so e contains what it did in that time, to and fro. While such a
-//! tool moves, e is therefore the mean over some tenths of a second. If the copy, which is passive, has given the client's tool
-//! more energy than it got from it, that comes from other tools, and may leave the client's port
-//! ([`crate::Envelope::supply`]).
+//! tool moves, e is therefore the mean over some tenths of a second. If the copy has given the client's tool more energy than it
+//! got from it, that comes from other tools, and may leave the client's port ([`crate::Envelope::supply`]): at most as much as these
+//! gave to the copy. A copy is not quite passive: tips of an instrument that overlap, stick and turn may get more than they gave.
+//! Without that bound, their excess would be credit.
 //!
 //! **Selection.** The local model is also computed beside the copy. When a sample arrives, both forecasts for t₀ are
 //! compared with it. If the copy's error over some tenths of a second is larger than the local model's, and larger
@@ -55,9 +56,22 @@ pub struct Predicted {
     pub wrench: Wrench,
     /// State of contact between the tool and the copy.
     pub contact_state: ContactState,
-    /// Work that the client's tool has done on the copy since it was made, J: negative if it got more than it gave, because other
-    /// tools have pushed it.
+    /// Work that the client's tool has done on the copy since it was made, J: negative if it got more than it gave.
     pub own_work_j: f64,
+    /// Work that all other tools have done on the copy since it was made, J; 0 without any.
+    pub others_work_j: f64,
+}
+
+impl Predicted {
+    /// Returns the energy that other tools have given to the client's through the copy, J: what that got beyond what it gave, at
+    /// most what they gave.
+    fn supplied_j(&self) -> f64 {
+        (-self.own_work_j).min(self.others_work_j).max(0.0)
+    }
+
+    fn is_sound(&self) -> bool {
+        self.wrench.is_finite() && self.own_work_j.is_finite() && self.others_work_j.is_finite()
+    }
 }
 
 /// Another tool on the tissue, as far as the client knows.
@@ -171,11 +185,10 @@ impl Prediction {
     /// Moves the tools in the copy. Returns by how much the energy that others have given to the client's tool has changed since
     /// the last answer, J.
     pub(crate) fn move_to(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> f64 {
-        let is_sound = |felt: &Predicted| felt.wrench.is_finite() && felt.own_work_j.is_finite();
-        self.now = self.predictor.feel(now_s, pose, others).filter(is_sound);
+        self.now = self.predictor.feel(now_s, pose, others).filter(Predicted::is_sound);
         self.others_move = others.iter().any(|other| other.motion.velocity_m_per_s != DVec3::ZERO);
         let Some(now) = self.now else { return 0.0 };
-        let supplied_j = (-now.own_work_j).max(0.0);
+        let supplied_j = now.supplied_j();
         supplied_j - std::mem::replace(&mut self.supplied_j, supplied_j)
     }
 
@@ -258,5 +271,42 @@ impl std::fmt::Debug for Prediction {
         let mut fields = f.debug_struct("Prediction");
         fields.field("now", now).field("error", error).field("squared", squared).field("is_worse", is_worse);
         fields.finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct CountingCopy(Vec<[f64; 2]>);
+
+    impl Predictor for CountingCopy {
+        fn feel(&mut self, _: f64, _: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
+            let [own_work_j, others_work_j] = self.0.pop()?;
+            Some(Predicted { wrench: Wrench::default(), contact_state: ContactState::Free, own_work_j, others_work_j })
+        }
+    }
+
+    #[test]
+    fn a_tool_gets_no_more_energy_from_others_than_they_gave() {
+        // Work of the own tool and of others, J, and the credit that changes with it.
+        let rows = [
+            ([0.002, 0.0], 0.0),
+            // A copy that is not passive, without others.
+            ([-0.001, 0.0], 0.0),
+            ([-0.001, 0.0004], 0.0004),
+            ([-0.001, 0.003], 0.0006),
+            ([-0.0025, 0.003], 0.0015),
+            // What goes back is taken back; others that have got energy give none.
+            ([-0.0005, 0.003], -0.002),
+            ([0.001, 0.003], -0.0005),
+            ([-0.001, -0.003], 0.0),
+        ];
+        let copy = CountingCopy(rows.iter().rev().map(|row| row.0).collect());
+        let mut prediction = Prediction::new(Box::new(copy));
+        for (tick, (works_j, credit_j)) in (0_u32..).zip(rows) {
+            let changed_j = prediction.move_to(1e-3 * f64::from(tick), &InstrumentPose::at(DVec3::ZERO), &[]);
+            assert!((changed_j - credit_j).abs() < 1e-15, "{works_j:?}: {changed_j} J");
+        }
     }
 }

@@ -492,6 +492,7 @@ mod tests {
                 wrench: Wrench::of_force(-400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z),
                 contact_state,
                 own_work_j: 0.0,
+                others_work_j: 0.0,
             })
         }
     }

@@ -33,8 +33,12 @@ impl Predictor for Copy {
     fn feel(&mut self, _: f64, pose: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
         let place_m = pose.place_m;
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
-        let felt =
-            Predicted { wrench: Wrench::of_force(self.factor * force_n(place_m)), contact_state, own_work_j: 0.0 };
+        let felt = Predicted {
+            wrench: Wrench::of_force(self.factor * force_n(place_m)),
+            contact_state,
+            own_work_j: 0.0,
+            others_work_j: 0.0,
+        };
         (!self.is_off.load(Ordering::Relaxed)).then_some(felt)
     }
 }

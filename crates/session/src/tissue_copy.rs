@@ -81,8 +81,9 @@ pub struct TissueCopy {
     is_led: Vec<bool>,
     /// The other tools on the copy.
     others: [Option<LedTool>; MAX_OTHERS],
-    /// The work of each tip.
+    /// The work of each tip, and of the tool in each place of `others`, those included that were there before.
     work: Vec<ToolWork>,
+    others_work: [ToolWork; MAX_OTHERS],
     due: Vec<Due>,
     /// The client's time minus the copy's, s; `None` before the first tick.
     ahead_s: Option<f64>,
@@ -108,6 +109,7 @@ impl TissueCopy {
             is_led: vec![false; tips],
             others: [None; MAX_OTHERS],
             work: vec![ToolWork::default(); tips],
+            others_work: [ToolWork::default(); MAX_OTHERS],
             due: Vec::with_capacity(tips + 2 * MAX_OTHERS),
             ahead_s: None,
             pose: InstrumentPose::at(DVec3::ZERO),
@@ -162,7 +164,8 @@ impl TissueCopy {
             self.lead_others(now_s - f64::from(steps - step) * step_s, others);
             self.session.advance(&mut self.due, |_| {});
             let tissue = self.session.tissue();
-            self.work.iter_mut().enumerate().for_each(|(tool, work)| work.add(tissue.tool_contact(tool)));
+            let all = self.work.iter_mut().chain(&mut self.others_work);
+            all.enumerate().for_each(|(tool, work)| work.add(tissue.tool_contact(tool)));
         }
         if steps > 0 {
             self.pose = *pose;
@@ -246,8 +249,9 @@ impl Predictor for TissueCopy {
         let wrench = self.instrument.wrench(&self.instrument.lead(pose), forces_n);
         // A tip that holds, sticks or slides says so for all.
         let touching = felt().map(|(_, contact)| contact.contact_state).find(|state| *state != ContactState::Free);
-        let own_work_j = self.work.iter().map(|work| work.done_j).sum();
-        Some(Predicted { wrench, contact_state: touching.unwrap_or(ContactState::Free), own_work_j })
+        let [own_work_j, others_work_j] =
+            [&self.work[..], &self.others_work].map(|works| works.iter().map(|work| work.done_j).sum());
+        Some(Predicted { wrench, contact_state: touching.unwrap_or(ContactState::Free), own_work_j, others_work_j })
     }
 }
 
@@ -355,7 +359,7 @@ mod tests {
             let passed = |from: u32| f64::from(tick.saturating_sub(from).min(100)) / 100.0;
             passed(begins[0]) - passed(begins[1])
         };
-        let (mut gave_j, mut gets_j) = (0.0_f64, 0.0);
+        let (mut gave_j, mut gets_j, mut others_j) = (0.0_f64, 0.0, 0.0);
         for tick in 0..500 {
             let time_s = f64::from(tick) * TICK_S;
             let place_m = DVec3::new(0.035, 0.0375, 0.001 - 0.003 * depth_m(tick, [100, 300]));
@@ -363,9 +367,10 @@ mod tests {
             let motion = MotionState { time_s, place_m: beside_m, velocity_m_per_s: DVec3::ZERO };
             let felt = copy.feel(time_s, &at(place_m), &[OtherTool { tool: 1, tip: Tip::default(), motion }]).unwrap();
             gave_j = gave_j.max(felt.own_work_j);
-            gets_j = -felt.own_work_j;
+            (gets_j, others_j) = (-felt.own_work_j, felt.others_work_j);
         }
         assert!(gets_j > 1e-6 && gets_j > gave_j, "gave {gave_j} J, got {gets_j} J more");
+        assert!(others_j > gets_j, "the other tool gave {others_j} J, and this one got {gets_j} J");
     }
 
     #[test]

@@ -154,7 +154,12 @@ mod tests {
     use super::*;
 
     fn pressed(place_m: DVec3) -> Predicted {
-        Predicted { wrench: Wrench::of_force(-400.0 * place_m), contact_state: ContactState::Sticking, own_work_j: 0.0 }
+        Predicted {
+            wrench: Wrench::of_force(-400.0 * place_m),
+            contact_state: ContactState::Sticking,
+            own_work_j: 0.0,
+            others_work_j: 0.0,
+        }
     }
 
     /// A spring.

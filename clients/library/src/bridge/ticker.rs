@@ -540,7 +540,12 @@ mod tests {
     impl Predictor for TellingCopy {
         fn feel(&mut self, _: f64, _: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted> {
             self.0.write(|told| *told = others.to_vec());
-            Some(Predicted { wrench: Wrench::default(), contact_state: ContactState::Free, own_work_j: 0.0 })
+            Some(Predicted {
+                wrench: Wrench::default(),
+                contact_state: ContactState::Free,
+                own_work_j: 0.0,
+                others_work_j: 0.0,
+            })
         }
     }
 
