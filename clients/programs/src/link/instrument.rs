@@ -4,7 +4,6 @@
 //! damper and spring of [`Hand`] at a radius of [`GYRATION_M`] from the instrument's place.
 
 use std::f64::consts::TAU;
-use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
 use palpate_haptics::envelope::Envelope;
@@ -12,21 +11,17 @@ use palpate_haptics::hand::{Hand, HandState};
 use palpate_haptics::{
     Instrument, InstrumentPose, InstrumentRenderer, InstrumentVelocity, Prediction, Tip, Wrench, WrenchSample,
 };
-use palpate_session::command::Command;
-use palpate_session::led_instrument::LedInstrument;
-use palpate_session::simulation::Simulation;
+use palpate_session::led_instrument::InstrumentSample;
 use palpate_session::tissue_copy::TissueCopy;
 use palpate_simulated::network::{Direction, Transport};
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
-use palpate_tissue::Model;
-use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::script::Action;
 
+use super::led_tissue::LedTissue;
 use super::run::operate;
 use super::setup::{Setup, TICK_S, ticks};
 use super::spot::Spot;
-use super::tissue::{LEASE, ns};
+use super::tissue::ns;
 
 /// The instrument that a hand leads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -134,54 +129,16 @@ impl TurningHand {
     }
 }
 
-/// A tissue with the instrument, as on a server.
-struct LedTissue {
-    simulation: Simulation,
-    led: LedInstrument,
-    /// Whether poses may overtake each other.
-    by_datagram: bool,
-}
-
-impl LedTissue {
-    fn new(model: &Arc<Model>, instrument: &Instrument) -> Result<Self, String> {
-        let limits = Limits::default();
-        let mut simulation = Simulation::new(model, &limits);
-        let tools: Vec<u32> = (0..).take(instrument.tips.len()).collect();
-        let acquired = simulation.intake.acquire(&tools, "palpate-client link", limits.lease_s, LEASE, 0);
-        acquired.map_err(|refusal| refusal.to_string())?;
-        Ok(LedTissue { simulation, led: LedInstrument::new(instrument.clone(), 0), by_datagram: false })
-    }
-
-    /// Leads the instrument to a pose by the command with a number; it is played by the client's time if that is not 0.
-    fn lead(&mut self, number: u64, pose: &InstrumentPose, client_time_ns: u64, now_s: f64) -> Result<(), String> {
-        let by_datagram = self.by_datagram && client_time_ns != 0;
-        let command = Command { client_time_ns, by_datagram, ..Command::new(0, Some(number), Action::Release) };
-        let commands = self.led.lead(&command, pose, None, self.simulation.session.model().shape());
-        let is_far = commands.iter().all(|command| command.action == Action::Release);
-        self.simulation.intake.submit(LEASE, commands, ns(now_s)).map_err(|refusal| refusal.to_string())?;
-        self.led.accepted(&command, *pose, None, is_far);
-        Ok(())
-    }
-
-    /// Does the steps of the tick that begins at `now_s`. Returns what the instrument feels after them.
-    fn step(&mut self, now_s: f64) -> Result<Option<WrenchSample>, String> {
-        while self.simulation.session.time_s() < now_s + TICK_S - 1e-9 {
-            let begin_s = self.simulation.session.time_s();
-            self.simulation.step(ns(begin_s)).map_err(|refusal| refusal.to_string())?;
-            if let Some(reason) = self.simulation.session.fault() {
-                return Err(reason);
-            }
-        }
-        let sample = self.simulation.session.sample(None);
-        self.led.see(&sample);
-        let felt = self.led.sample(&sample, []);
-        Ok(felt.map(|felt| WrenchSample {
-            sequence: self.simulation.session.step_count(),
-            client_time_s: felt.client_time_s,
-            pose: felt.pose,
-            wrench: felt.wrench,
-        }))
-    }
+/// Does the steps of a tick of a tissue with one instrument. Returns what that feels after them.
+fn step(tissue: &mut LedTissue, now_s: f64) -> Result<Option<WrenchSample>, String> {
+    let felt = tissue.step(now_s)?.into_iter().flatten().next();
+    let sequence = tissue.step_count();
+    Ok(felt.map(|(InstrumentSample { client_time_s, pose, wrench, .. }, _)| WrenchSample {
+        sequence,
+        client_time_s,
+        pose,
+        wrench,
+    }))
 }
 
 /// The outcome of a run.
@@ -248,15 +205,15 @@ fn scale(setup: &Setup, kind: InstrumentKind, instrument: &Instrument) -> Result
     let most_n = task::FORCE_SHARE * setup.device.most_n();
     let mut scale = task::scale(&setup.hand, &setup.law, setup.device.most_n());
     loop {
-        let mut tissue = LedTissue::new(&setup.model, instrument)?;
+        let mut tissue = LedTissue::new(&setup.model, instrument, 1)?;
         let course = Course::new(setup, kind, scale);
         let mut hand = TurningHand::new(setup.hand, course.task.start_m());
         let mut most = 0.0_f64;
         for tick in 0..ticks(setup.duration_s) {
             let now_s = f64::from(tick) * TICK_S;
             let pose = in_tissue(&setup.spot, &hand.pose(kind.orientation(), course.turning.jaw_rad(now_s)));
-            tissue.lead(u64::from(tick) + 1, &pose, 0, now_s)?;
-            let felt = tissue.step(now_s)?.map_or(Wrench::default(), |felt| of_hand(&setup.spot, &felt.wrench));
+            tissue.lead(0, u64::from(tick) + 1, &pose, 0, now_s)?;
+            let felt = step(&mut tissue, now_s)?.map_or(Wrench::default(), |felt| of_hand(&setup.spot, &felt.wrench));
             most = most.max(felt.force_n.length());
             if most > most_n {
                 break;
@@ -306,7 +263,7 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
     let instrument = kind.instrument(setup.tip);
     let course = Course::new(setup, kind, scale(setup, kind, &instrument)?);
     let (mut server, mut twin) =
-        (LedTissue::new(&setup.model, &instrument)?, LedTissue::new(&setup.model, &instrument)?);
+        (LedTissue::new(&setup.model, &instrument, 1)?, LedTissue::new(&setup.model, &instrument, 1)?);
     let mut up = Direction::<(u64, InstrumentPose, f64)>::new(setup.conditions, setup.seed, 1, task::LEAD_S);
     let mut down = Direction::<WrenchSample>::new(setup.conditions, setup.seed, 2, task::LEAD_S);
     server.by_datagram = setup.conditions.transport == Transport::Datagram;
@@ -333,17 +290,17 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
         let number = u64::from(tick) + 1;
         up.send(now_s, POSE_BYTES, (number, pose, now_s));
         while let Some((number, pose, sent_s)) = up.receive(now_s) {
-            server.lead(number, &pose, ns(sent_s).max(1), now_s)?;
+            server.lead(0, number, &pose, ns(sent_s).max(1), now_s)?;
         }
-        if let Some(sample) = server.step(now_s)? {
+        if let Some(sample) = step(&mut server, now_s)? {
             down.send(now_s, SAMPLE_BYTES, sample);
         }
         while let Some(sample) = down.receive(now_s) {
             renderer.receive(sample, now_s);
         }
         let rendered = renderer.tick(now_s, &pose);
-        twin.lead(number, &pose, 0, now_s)?;
-        let truth = twin.step(now_s)?.map_or(Wrench::default(), |felt| felt.wrench);
+        twin.lead(0, number, &pose, 0, now_s)?;
+        let truth = step(&mut twin, now_s)?.map_or(Wrench::default(), |felt| felt.wrench);
         let touches = truth.force_n != DVec3::ZERO || rendered.force_n.length() > 1e-6;
         if touches && now_s > task::LEAD_S {
             errors.add(&rendered, &truth);

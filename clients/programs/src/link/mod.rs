@@ -2,13 +2,14 @@
 //! the result. Only this program drives a tissue itself.
 
 mod boundary;
-mod clash;
 mod client;
+mod collision;
 mod direct;
 mod figures;
 mod instrument;
 mod instrument_runs;
 mod laws;
+mod led_tissue;
 mod live;
 mod measure;
 mod poses;
@@ -39,7 +40,7 @@ use crate::ClientFailure;
 use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
 use crate::table;
-use clash::Clash;
+use collision::Collision;
 use figures::{figures, rows};
 use instrument::InstrumentKind;
 use laws::PlaceLaws;
@@ -66,7 +67,7 @@ pub(crate) struct LinkArguments {
     /// Two hands push shafts of 60 mm together above the tissue, at 0.1 m/s, and back, every two seconds. --second-hand own: both are
     /// hands of this client
     #[arg(long, value_name = "HOW", group = "second", conflicts_with_all = ["instrument", "second_tool_mm", "tissue_change_s", "stall_ms", "scheme", "deadband", "up_deadband", "course", "server", "boundary", "random"])]
-    clash: Option<Clash>,
+    collision: Option<Collision>,
     /// Round-trip time, ms
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     rtt_ms: Option<f64>,
@@ -95,7 +96,7 @@ pub(crate) struct LinkArguments {
     /// A second tool with its own seed presses at this distance from the place of the task, mm
     #[arg(long, value_name = "MM", default_value_t = 0.0, group = "second", conflicts_with_all = ["random", "boundary"])]
     second_tool_mm: f64,
-    /// With --second-tool-mm or --clash: who leads the second tool or instrument
+    /// With --second-tool-mm or --collision: who leads the second tool or instrument
     #[arg(long, value_name = "WHOSE", default_value = "another", requires = "second")]
     second_hand: SecondLeader,
     /// The tissue changes at this time, s
@@ -201,8 +202,8 @@ pub(crate) async fn link(arguments: &LinkArguments) -> Result<(), ClientFailure>
         return random::print(arguments, runs);
     }
     let setup = memory::attempt("--scene", || setup(arguments))?;
-    if let Some(clash) = arguments.clash {
-        return clash::print(arguments, &setup, clash);
+    if let Some(collision) = arguments.collision {
+        return collision::print(arguments, &setup, collision);
     }
     if let Some(kind) = arguments.instrument {
         return instrument_runs::print(arguments, &setup, kind);
@@ -237,7 +238,7 @@ fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, ClientF
 fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let limits = Limits::default();
     let hand = hand_named(&arguments.hand)?;
-    let usual = if arguments.instrument.is_some() || arguments.clash.is_some() { "sigma7" } else { "omega3" };
+    let usual = if arguments.instrument.is_some() || arguments.collision.is_some() { "sigma7" } else { "omega3" };
     let device = device_named(arguments.device.as_deref().unwrap_or(usual))?;
     let conditions = match arguments.profile {
         Some(profile) => profile.conditions(),

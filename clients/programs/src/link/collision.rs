@@ -1,4 +1,4 @@
-//! `link --clash`: two hands push their instruments together, above the tissue.
+//! `link --collision`: two hands push their instruments together, above the tissue.
 //!
 //! Each hand leads a shaft that points along x of the hands' frame, or across; both move along z, each at half of [`CLOSING_M_PER_S`],
 //! until their targets lie [`BEYOND_M`] beyond each other, wait, and go back. Then they do it again.
@@ -12,26 +12,23 @@ use palpate_haptics::{
     Instrument, InstrumentPart, InstrumentPose, InstrumentRenderer, OtherInstrument, Prediction, SecondHand, Tip,
     TipShape, WrenchSample,
 };
-use palpate_session::command::Command;
-use palpate_session::led_instrument::{InstrumentSample, LedInstrument};
-use palpate_session::simulation::Simulation;
+use palpate_session::led_instrument::InstrumentSample;
 use palpate_session::tissue_copy::TissueCopy;
 use palpate_simulated::network::{Direction, Transport};
-use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::script::Action;
 use serde_json::json;
 
 use super::instrument::{POSE_BYTES, SAMPLE_BYTES, TurningHand, in_tissue, of_hand};
+use super::led_tissue::{LedTissue, tips};
 use super::run::operate;
 use super::setup::{self, Setup, TICK_S, ticks};
-use super::tissue::{LEASE, ns};
+use super::tissue::ns;
 use super::{LinkArguments, with_tissue};
 use crate::ClientFailure;
 use crate::table;
 
 /// How two shafts meet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Clash {
+pub(super) enum Collision {
     /// The middle of one across the middle of the other
     Crossed,
     /// The tip of one on the middle of the other
@@ -40,7 +37,7 @@ pub(super) enum Clash {
 
 /// Length of a shaft, m.
 const SHAFT_M: f64 = 0.06;
-/// Height of the place of the clash above the tissue, m.
+/// Height of the place of the collision above the tissue, m.
 const HEIGHT_M: f64 = 0.08;
 /// Speed at which the targets approach each other, m/s, and how far they go beyond the place where the shafts touch, m.
 const CLOSING_M_PER_S: f64 = 0.1;
@@ -59,20 +56,20 @@ fn way_m(now_s: f64) -> f64 {
 }
 
 /// Returns the poses of both instruments where they just touch, in the hands' frame; the second comes from above.
-fn touching(clash: Clash, middle_m: DVec3, radius_m: f64) -> [InstrumentPose; 2] {
+fn touching(collision: Collision, middle_m: DVec3, radius_m: f64) -> [InstrumentPose; 2] {
     let half = 0.5 * SHAFT_M;
     let lower = InstrumentPose::at(middle_m + half * DVec3::X);
     let above_m = middle_m + 2.0 * radius_m * DVec3::Z;
-    let (orientation, place_m) = match clash {
-        Clash::Crossed => (DQuat::from_rotation_z(FRAC_PI_2), above_m + half * DVec3::Y),
+    let (orientation, place_m) = match collision {
+        Collision::Crossed => (DQuat::from_rotation_z(FRAC_PI_2), above_m + half * DVec3::Y),
         // It points along -z.
-        Clash::Tip => (DQuat::from_rotation_y(FRAC_PI_2), above_m),
+        Collision::Tip => (DQuat::from_rotation_y(FRAC_PI_2), above_m),
     };
     [lower, InstrumentPose { orientation, ..InstrumentPose::at(place_m) }]
 }
 
 /// A hand with its instrument, and the network to its server.
-struct ClashingHand {
+struct CollidingHand {
     hand: TurningHand,
     touching: InstrumentPose,
     /// The direction in which it pushes, along z.
@@ -89,7 +86,7 @@ struct ClashingHand {
     energy_min_j: f64,
 }
 
-impl ClashingHand {
+impl CollidingHand {
     fn new(setup: &Setup, which: u8, touching: InstrumentPose, instrument: &Instrument) -> Self {
         let (sign, number) = if which == 0 { (1.0, 0) } else { (-1.0, 1) };
         let mut envelope = Envelope::new(setup.device, setup.spot.of_tissue(touching.place_m));
@@ -99,7 +96,7 @@ impl ClashingHand {
         renderer.predict(Some(Prediction::new(Box::new(copy))));
         let direction = |at: u64| (setup.conditions, setup.seed, 1 + 2 * u64::from(which) + at);
         let [(of_up, seed, up), (of_down, _, down)] = [direction(0), direction(1)];
-        ClashingHand {
+        CollidingHand {
             hand: TurningHand::new(setup.hand, touching.place_m - sign * WAY_M * DVec3::Z),
             touching,
             sign,
@@ -139,69 +136,9 @@ impl ClashingHand {
     }
 }
 
-/// Both instruments on one tissue, as on a server.
-struct LedPair {
-    simulation: Simulation,
-    led: [LedInstrument; 2],
-    by_datagram: bool,
-}
-
-fn tips(instrument: &Instrument) -> u32 {
-    u32::try_from(instrument.tips.len()).unwrap_or(u32::MAX)
-}
-
-impl LedPair {
-    fn new(setup: &Setup, instrument: &Instrument) -> Result<Self, String> {
-        let (limits, count) = (Limits::default(), tips(instrument));
-        let mut simulation = Simulation::new(&setup.model, &limits);
-        for which in 0..2 {
-            let tools: Vec<u32> = (which * count..(which + 1) * count).collect();
-            let lease = LEASE + u128::from(which);
-            let acquired = simulation.intake.acquire(&tools, "palpate-client link", limits.lease_s, lease, 0);
-            acquired.map_err(|refusal| refusal.to_string())?;
-        }
-        let led = [0, count].map(|first_tool| LedInstrument::new(instrument.clone(), first_tool));
-        Ok(LedPair { simulation, led, by_datagram: setup.conditions.transport == Transport::Datagram })
-    }
-
-    fn lead(
-        &mut self,
-        which: usize,
-        number: u64,
-        pose: &InstrumentPose,
-        sent_s: f64,
-        now_s: f64,
-    ) -> Result<(), String> {
-        let led = &mut self.led[which];
-        let command = Command::new(led.first_tool(), Some(number), Action::Release);
-        let command = Command { client_time_ns: ns(sent_s).max(1), by_datagram: self.by_datagram, ..command };
-        let commands = led.lead(&command, pose, None, self.simulation.session.model().shape());
-        let is_far = commands.iter().all(|command| command.action == Action::Release);
-        let lease = LEASE + which as u128;
-        self.simulation.intake.submit(lease, commands, ns(now_s)).map_err(|refusal| refusal.to_string())?;
-        led.accepted(&command, *pose, None, is_far);
-        Ok(())
-    }
-
-    /// Does the steps of a tick. Returns what each instrument feels after them, and where it is.
-    fn step(&mut self, now_s: f64) -> Result<[Option<(InstrumentSample, OtherInstrument)>; 2], String> {
-        while self.simulation.session.time_s() < now_s + TICK_S - 1e-9 {
-            let begin_s = self.simulation.session.time_s();
-            self.simulation.step(ns(begin_s)).map_err(|refusal| refusal.to_string())?;
-        }
-        let sample = self.simulation.session.sample(None);
-        self.led.iter_mut().for_each(|led| led.see(&sample));
-        let now_s = sample.simulation_time_s;
-        let seen = [0, 1].map(|which: usize| self.led[which].seen(now_s));
-        let felt = self.led.each_mut().map(|led| led.sample(&sample, seen.iter().flatten().copied()));
-        let [one, other] = felt;
-        Ok([one.zip(seen[0]), other.zip(seen[1])])
-    }
-}
-
 /// The outcome of a run.
 #[derive(Debug, Clone, Default)]
-struct ClashOutcome {
+struct CollisionOutcome {
     /// Sum of both radii, m.
     reach_m: f64,
     deepest_at_clients_m: f64,
@@ -212,27 +149,29 @@ struct ClashOutcome {
     energy_together_min_j: f64,
 }
 
-fn run(setup: &Setup, clash: Clash) -> Result<ClashOutcome, String> {
+fn run(setup: &Setup, collision: Collision) -> Result<CollisionOutcome, String> {
     let tip = Tip { shape: if setup.tip.shape.is_rigid() { TipShape::Sphere } else { setup.tip.shape }, ..setup.tip };
     let mut instrument = Instrument::default();
     instrument.add_row(DVec3::ZERO, -SHAFT_M * DVec3::X, tip, InstrumentPart::Body);
-    let [lower, upper] = touching(clash, setup.spot.at_m + HEIGHT_M * DVec3::Z, tip.radius_m);
-    let mut hands = [ClashingHand::new(setup, 0, lower, &instrument), ClashingHand::new(setup, 1, upper, &instrument)];
-    let mut server = LedPair::new(setup, &instrument)?;
+    let [lower, upper] = touching(collision, setup.spot.at_m + HEIGHT_M * DVec3::Z, tip.radius_m);
+    let mut hands =
+        [CollidingHand::new(setup, 0, lower, &instrument), CollidingHand::new(setup, 1, upper, &instrument)];
+    let mut server = LedTissue::new(&setup.model, &instrument, 2)?;
+    server.by_datagram = setup.conditions.transport == Transport::Datagram;
     let is_own = setup.second_hand == setup::SecondLeader::Own;
     let tells = setup.second_hand != setup::SecondLeader::Unknown;
-    let mut outcome = ClashOutcome { reach_m: 2.0 * tip.radius_m, ..ClashOutcome::default() };
+    let mut outcome = CollisionOutcome { reach_m: 2.0 * tip.radius_m, ..CollisionOutcome::default() };
     for tick in 0..ticks(setup.duration_s) {
         let (now_s, number) = (f64::from(tick) * TICK_S, u64::from(tick) + 1);
         for (which, hand) in hands.iter_mut().enumerate() {
             let pose = hand.pose(setup);
             hand.up.send(now_s, POSE_BYTES, (number, pose, now_s));
             while let Some((number, pose, sent_s)) = hand.up.receive(now_s) {
-                server.lead(which, number, &pose, sent_s, now_s)?;
+                server.lead(which, number, &pose, ns(sent_s).max(1), now_s)?;
             }
         }
         let felt = server.step(now_s)?;
-        let sequence = server.simulation.session.step_count();
+        let sequence = server.step_count();
         for (which, hand) in hands.iter_mut().enumerate() {
             let Some((felt_now, _)) = &felt[which] else { continue };
             let deepest_m = felt_now.contacts.iter().map(|(_, load)| load.depth_m).fold(0.0, f64::max);
@@ -263,9 +202,10 @@ fn run(setup: &Setup, clash: Clash) -> Result<ClashOutcome, String> {
 ///
 /// # Errors
 /// Returns an error if the run fails.
-pub(super) fn print(arguments: &LinkArguments, setup: &Setup, clash: Clash) -> Result<(), ClientFailure> {
-    let outcome = with_tissue(|| run(setup, clash))?;
-    let ClashOutcome { reach_m, deepest_at_clients_m, deepest_at_server_m, force_max_n, energy_min_j, .. } = outcome;
+pub(super) fn print(arguments: &LinkArguments, setup: &Setup, collision: Collision) -> Result<(), ClientFailure> {
+    let outcome = with_tissue(|| run(setup, collision))?;
+    let CollisionOutcome { reach_m, deepest_at_clients_m, deepest_at_server_m, force_max_n, energy_min_j, .. } =
+        outcome;
     let deepest_m = deepest_at_clients_m.max(deepest_at_server_m);
     if arguments.json {
         crate::tell!(
