@@ -144,6 +144,21 @@ async fn clients_that_are_killed_leave_no_tool_held_and_no_session() {
     waited.await.expect("the sessions of a load that was killed stay");
 }
 
+/// Hands lead instruments: each pose moves all of their tips. A busy machine has no room for all users.
+#[tokio::test(flavor = "multi_thread")]
+async fn users_of_a_plan_lead_instruments() {
+    let (server, folder) = (TestServer::start(&[]), tempfile::tempdir().unwrap());
+    let plan = "[[hand]]\nhand = \"medium\"\ninstrument = \"shaft\"\n[[hand]]\nhand = \"light\"\ninstrument = \"grasper\"\n\
+                [[phase]]\nseconds = 3\narrivals = \"spike\"\nusers = 4\nobjective = \"rejected<1\"\n";
+    let output = planned(&server, folder.path(), plan, &["--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(told["kept"], true, "{told}");
+    let hands = told["mix"]["hands"].as_object().unwrap();
+    assert!(hands.keys().all(|hand| ["medium shaft", "light grasper"].contains(&&**hand)), "{hands:?}");
+    assert!(number(&told, "/all/commands") > 100.0 && number(&told, "/all/round_trip_us/p50") > 0.0, "{told}");
+}
+
 /// Every part that a plan may have. Users that are far away wait at least 20 ms.
 const PLAN: &str = r#"
 name = "<all> & more"

@@ -15,7 +15,7 @@ use tokio_stream::wrappers::WatchStream;
 
 use super::stroke::Stroke;
 use super::tally::Tally;
-use super::tip::{self, Lead, LedTip};
+use super::tip::{self, HeldTool, Lead};
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -80,9 +80,9 @@ struct Sent {
     acknowledged: u64,
     last_tick: Option<u64>,
     is_open: bool,
-    /// The tool of a client that leads one with a tip, and the command that a sample acknowledged last, with its
+    /// What a client leads by poses, and the command that a sample acknowledged last, with its
     /// time, ns.
-    led: Option<LedTip>,
+    led: Option<HeldTool>,
     newest: (u64, u64),
 }
 
@@ -189,7 +189,7 @@ impl Client {
         let inbound = Touch::open(channel, open, commands.map(Say::Command)).await?;
         {
             let mut sent = lock(&sent);
-            sent.led = touches.and_then(|lead| LedTip::new(inbound.opened(), &lead, self.seed, self.middle_m));
+            sent.led = touches.and_then(|lead| HeldTool::new(inbound.opened(), &lead, self.seed, self.middle_m));
             if touches.is_some() && sent.led.is_none() {
                 return Err(tonic::Status::failed_precondition("the server sent no force law for --touch"));
             }

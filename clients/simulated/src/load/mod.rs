@@ -5,6 +5,8 @@
 
 mod client;
 mod connections;
+mod holding;
+mod led_instrument;
 mod objective;
 mod plan;
 mod plan_run;

@@ -9,6 +9,7 @@ use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_tissue::files::read_text;
 use palpate_tissue::scene::toml_document::{Document, Fields, Item};
 
+use super::led_instrument::InstrumentKind;
 use super::objective::Objective;
 use super::tip::{Deadbands, Lead, default_device};
 use crate::network::Conditions;
@@ -338,8 +339,22 @@ fn lead(fields: &mut Fields<'_>) -> Result<Option<Lead>> {
     let device = device.transpose()?;
     let fraction = |fields: &mut Fields<'_>, key| within(fields, key, "from 0 to 1", 0.0, 1.0);
     let (down, up) = (fraction(fields, "deadband")?, fraction(fields, "up_deadband")?);
+    let item = fields.item("instrument");
+    let instrument = item.as_ref().map(|item| {
+        let name = item.as_text().unwrap_or_default();
+        let found = InstrumentKind::ALL.iter().find(|kind| kind.1 == name);
+        found.map(|kind| kind.0).ok_or_else(|| {
+            item.wrong(&format!("one of {}", quoted(InstrumentKind::ALL.map(|kind| kind.1).into_iter())))
+        })
+    });
+    let instrument = instrument.transpose()?;
+    let given = [
+        ("device", device.is_some()),
+        ("deadband", down.is_some()),
+        ("up_deadband", up.is_some()),
+        ("instrument", instrument.is_some()),
+    ];
     let Some(hand) = hand else {
-        let given = [("device", device.is_some()), ("deadband", down.is_some()), ("up_deadband", up.is_some())];
         return match given.iter().find(|key| key.1) {
             Some((key, _)) => {
                 Err(fields.refuse(Reason::WrongKind, key, "is for a hand: this one pushes, and feels nothing"))
@@ -347,8 +362,11 @@ fn lead(fields: &mut Fields<'_>) -> Result<Option<Lead>> {
             None => Ok(None),
         };
     };
+    if let Some((key, _)) = given[..3].iter().find(|key| key.1 && instrument.is_some()) {
+        return Err(fields.refuse(Reason::WrongKind, key, "is for a hand without an instrument: that renders nothing"));
+    }
     let deadbands = Deadbands { down: down.unwrap_or(0.0), up: up.unwrap_or(0.0) };
-    Ok(Some(Lead { deadbands, device: device.unwrap_or_else(default_device), hand: Some(hand) }))
+    Ok(Some(Lead { deadbands, device: device.unwrap_or_else(default_device), hand: Some(hand), instrument }))
 }
 
 fn wire(fields: &mut Fields<'_>) -> Result<Wire> {
@@ -492,6 +510,19 @@ seconds = 5
             (&format!("{phase}[[hand]]\nhand = \"frim\""), ":4", "hand[0].hand", "firm"),
             (&format!("{phase}[[hand]]\nhand = \"firm\"\ndevice = \"omega\""), ":5", "hand[0].device", "omega3"),
             (&format!("{phase}[[hand]]\nhand = \"push\"\ndeadband = 0.1"), ":5", "hand[0].deadband", "feels nothing"),
+            (&format!("{phase}[[hand]]\nhand = \"firm\"\ninstrument = \"saw\""), ":5", "hand[0].instrument", "grasper"),
+            (
+                &format!("{phase}[[hand]]\nhand = \"push\"\ninstrument = \"shaft\""),
+                ":5",
+                "hand[0].instrument",
+                "feels nothing",
+            ),
+            (
+                &format!("{phase}[[hand]]\nhand = \"firm\"\ninstrument = \"shaft\"\ndevice = \"omega3\""),
+                ":6",
+                "hand[0].device",
+                "renders nothing",
+            ),
             (&format!("{phase}[[network]]\nname = \"x\"\nloss = 2"), ":5", "network[0].loss", "from 0 to 0.5"),
             (&format!("{phase}[[network]]\nname = \"x\"\ndelay = 2"), ":5", "network[0].delay", "delay_ms"),
             (&format!("{phase}[[viewers]]\nnumber = 99"), ":4", "viewers[0].number", "at most 16"),

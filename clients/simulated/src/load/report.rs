@@ -5,6 +5,7 @@ use std::fmt::Write;
 
 use serde_json::{Value, json};
 
+use super::led_instrument::InstrumentKind;
 use super::objective::Objective;
 use super::plan::{LoadPlan, User};
 use super::tally::{LoadOutcome, Tally, listed};
@@ -88,7 +89,8 @@ fn mix(plan: &LoadPlan, users: &[User]) -> Value {
     let mut counts: [BTreeMap<String, u64>; 4] = Default::default();
     for user in users {
         let hand = plan.leads[user.lead].what.map_or("push".to_owned(), |lead| {
-            format!("{} {}", lead.hand.map_or("stroke", |hand| hand.name), lead.device.name)
+            let with = lead.instrument.map_or(lead.device.name, InstrumentKind::name);
+            format!("{} {with}", lead.hand.map_or("stroke", |hand| hand.name))
         });
         let names = [
             plan.scenes[user.scene].what.clone(),

@@ -5,15 +5,15 @@ use glam::DVec3;
 use palpate_haptics::dead_reckoning::News;
 use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_haptics::device::UNDECLARED;
-use palpate_haptics::hand::{Hand, HandState};
+use palpate_haptics::hand::Hand;
 use palpate_haptics::{Device, Envelope, Renderer, RenderingState, Tip};
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, touch};
 use pb::command::Action;
 
+use super::holding::Holding;
+use super::led_instrument::{self, HeldInstrument, InstrumentKind};
 use super::stroke::Stroke;
-use crate::random::Random;
-use crate::task::{LEAD_S, Task};
 
 /// Deadbands of a simulated client: fractions of the force, 0 to 1, below which the two ends do not send changes to
 /// each other.
@@ -32,6 +32,8 @@ pub(crate) struct Lead {
     pub(crate) device: Device,
     /// The hand that holds the device; `None`: the tool follows the stroke exactly.
     pub(crate) hand: Option<Hand>,
+    /// The instrument that the hand leads, in place of a tool; then there is no device, and nothing is rendered.
+    pub(crate) instrument: Option<InstrumentKind>,
 }
 
 /// Returns the device of clients without another one.
@@ -39,18 +41,14 @@ pub(crate) fn default_device() -> Device {
     Device::named("omega3").unwrap_or(UNDECLARED)
 }
 
-/// Scale of the depths of a hand's presses, and duration of its task, s.
-const SCALE: f64 = 0.2;
-const LASTS_S: f64 = 3600.0;
-
 /// Interval at which a hand without forces enables them again, s.
 const ASKS_EVERY_S: f64 = 0.3;
 
-/// Longest time that a hand moves between two ticks, s.
-const MAX_S: f64 = 0.02;
-
 /// Returns the opening of a haptic stream for such a client: `open` with device, tip, deadband and heartbeat.
 pub(crate) fn opening(open: pb::TouchOpen, lead: &Lead) -> pb::TouchOpen {
+    if let Some(kind) = lead.instrument {
+        return led_instrument::opening(open, kind);
+    }
     pb::TouchOpen {
         device: Some(touch::device(&lead.device)),
         tip: Some(touch::tip(&Tip::default())),
@@ -61,39 +59,41 @@ pub(crate) fn opening(open: pb::TouchOpen, lead: &Lead) -> pb::TouchOpen {
     }
 }
 
-/// A hand that holds a device.
-struct Holding {
-    hand: Hand,
-    task: Task,
-    held: HandState,
-    force_n: DVec3,
-    /// The time of the first tick and of the last, s.
-    began_s: f64,
-    last_s: f64,
-    asked_s: f64,
+/// What one client leads.
+pub(crate) enum HeldTool {
+    Tip(Box<LedTip>),
+    Instrument(Box<HeldInstrument>),
 }
 
-impl Holding {
-    fn new(hand: Hand, seed: u64, middle_m: DVec3) -> Self {
-        let task = Task::new(middle_m, LEAD_S, LASTS_S, SCALE, &mut Random::new(seed, 0));
-        let held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
-        let never = f64::NEG_INFINITY;
-        Holding { hand, task, held, force_n: DVec3::ZERO, began_s: f64::NAN, last_s: never, asked_s: never }
+impl HeldTool {
+    /// Creates what a client leads on a stream that was opened; arguments and result are those of [`LedTip::new`].
+    pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, seed: u64, middle_m: DVec3) -> Option<Self> {
+        match lead.instrument.zip(lead.hand) {
+            Some((kind, hand)) => Some(HeldTool::Instrument(Box::new(HeldInstrument::new(kind, hand, seed, middle_m)))),
+            None => LedTip::new(opened, lead, seed, middle_m).map(|tip| HeldTool::Tip(Box::new(tip))),
+        }
     }
 
-    /// Advances the hand to `now_s`. Returns the place of its tool, m.
-    fn place_m(&mut self, now_s: f64) -> DVec3 {
-        if self.began_s.is_nan() {
-            (self.began_s, self.last_s) = (now_s, now_s);
+    /// Adds a further law, if it is valid. An instrument needs none.
+    pub(crate) fn learn(&mut self, update: &pb::ForceLawUpdate) {
+        if let HeldTool::Tip(tip) = self {
+            tip.learn(update);
         }
-        let (passed_s, from_s) = ((now_s - self.last_s).clamp(0.0, MAX_S), self.last_s - self.began_s);
-        if passed_s > 0.0 {
-            let (from_m, to_m) = (self.task.at(from_s), self.task.at(from_s + passed_s));
-            let string_n = self.hand.string_n(from_m, self.held.place_m);
-            self.held = self.hand.advance(self.held, from_m, to_m, self.force_n + string_n, passed_s);
+    }
+
+    /// Receives a sample that arrived at `now_s`.
+    pub(crate) fn hear(&mut self, sample: &pb::Sample, now_s: f64) {
+        if let HeldTool::Tip(tip) = self {
+            tip.hear(sample, now_s);
         }
-        self.last_s = now_s;
-        self.held.place_m
+    }
+
+    /// Does one tick. Returns the pose to send, if one is due.
+    pub(crate) fn tick(&mut self, stroke: &Stroke, time_s: f64, now_s: f64) -> Option<Action> {
+        match self {
+            HeldTool::Tip(tip) => tip.tick(stroke, time_s, now_s),
+            HeldTool::Instrument(held) => Some(held.tick(now_s)),
+        }
     }
 }
 
@@ -108,7 +108,7 @@ pub(crate) struct LedTip {
 impl LedTip {
     /// Creates the tool of a stream that was opened, on a tissue with the centre `middle_m`; the seed determines the
     /// movements of a hand. `None` if the server sent no valid law.
-    pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, seed: u64, middle_m: DVec3) -> Option<Self> {
+    fn new(opened: &pb::TouchOpened, lead: &Lead, seed: u64, middle_m: DVec3) -> Option<Self> {
         let law = touch::from_law(opened.law.as_ref()?).ok()?;
         let renderer = Renderer::new(law, Envelope::new(lead.device, middle_m));
         let holding = lead.hand.map(|hand| Holding::new(hand, seed, middle_m));
@@ -116,7 +116,7 @@ impl LedTip {
     }
 
     /// Adds a further law, if it is valid.
-    pub(crate) fn learn(&mut self, update: &pb::ForceLawUpdate) {
+    fn learn(&mut self, update: &pb::ForceLawUpdate) {
         if let Some(message) = &update.law
             && let Ok(law) = touch::from_law(message)
         {
@@ -125,14 +125,14 @@ impl LedTip {
     }
 
     /// Receives a sample that arrived at `now_s`.
-    pub(crate) fn hear(&mut self, sample: &pb::Sample, now_s: f64) {
+    fn hear(&mut self, sample: &pb::Sample, now_s: f64) {
         if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
             self.renderer.receive(touch::from_local_model(model, sample.step), now_s);
         }
     }
 
     /// Does one tick of the device: renders a force. Returns the pose to send, if one is due.
-    pub(crate) fn tick(&mut self, stroke: &Stroke, time_s: f64, now_s: f64) -> Option<Action> {
+    fn tick(&mut self, stroke: &Stroke, time_s: f64, now_s: f64) -> Option<Action> {
         let place_m = match &mut self.holding {
             None => stroke.place_m(time_s)?,
             Some(holding) => {

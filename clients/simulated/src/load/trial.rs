@@ -36,7 +36,8 @@ impl LoadTrial {
     /// are measured together for `seconds`, and stay to the end. The clients reach the server directly; with `touch`,
     /// their device is the `omega3`. The plan has no objective.
     pub fn plan(&self, sessions: u32) -> LoadPlan {
-        let lead = self.touch.map(|deadbands| Lead { deadbands, device: default_device(), hand: None });
+        let lead =
+            self.touch.map(|deadbands| Lead { deadbands, device: default_device(), hand: None, instrument: None });
         let phase = Phase {
             name: "trial".to_owned(),
             seconds: self.seconds,
