@@ -227,10 +227,10 @@ bench-frames: need-rust
 	$(CARGO) bench --quiet --bench frames -- $(ARGUMENTS)
 
 # Ten thousand random scenes, as many that are merely legal, a soak of ten million steps, a thousand thin meshes under tips
-# (`PALPATE_STRESS_THIN=10000` takes hours), and five thousand snapshots that are restored.
+# (`PALPATE_STRESS_THIN=10000` takes hours), five thousand snapshots that are restored, and a million severed springs.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_SOLIDS=1000 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 $(CARGO) test --release \
-		--test stress --test legal --test physics --test thin --test restored -- --include-ignored --nocapture
+	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_SOLIDS=1000 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 PALPATE_STRESS_CUTS=1000000 \
+		$(CARGO) test --release --test stress --test legal --test physics --test thin --test restored --test cuts -- --include-ignored --nocapture
 
 # The unit tests of the tissue, and the golden hashes.
 KERNEL := --package palpate-tissue --package palpate --lib --test determinism

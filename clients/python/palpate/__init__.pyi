@@ -128,7 +128,8 @@ class Tissue:
 
 class Tip:
     """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
-    `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only."""
+    `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
+    `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only."""
 
     def __init__(
         self,
@@ -139,10 +140,11 @@ class Tip:
         stiffness_n_per_m: Optional[float] = None,
         damping_n_s_per_m: float = 0.0,
         shape: str = "disc",
+        edge_m: Optional[Vector] = None,
     ) -> None: ...
     @property
     def shape(self) -> str:
-        """The shape: disc, rigid or sphere."""
+        """The shape: disc, rigid, sphere or blade."""
     @property
     def radius_m(self) -> float:
         """The radius of the disc or sphere, m."""
@@ -202,6 +204,12 @@ class Session:
     def guard_events(self) -> int:
         """How often the guard went back to a checkpoint and halved the substep, or brought a solid that rested inside out to its
         shape."""
+    @property
+    def severed(self) -> int:
+        """The number of springs that blades have severed."""
+    @property
+    def pieces(self) -> int:
+        """The number of parts of the tissue: 1 if it is whole."""
     @property
     def fault(self) -> Optional[str]:
         """Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None if

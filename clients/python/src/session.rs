@@ -172,6 +172,21 @@ impl Session {
         self.with(py, |inner| inner.simulation.session.tissue().guard_events())
     }
 
+    /// The number of springs that blades have severed.
+    #[getter]
+    fn severed(&self, py: Python<'_>) -> usize {
+        self.with(py, |inner| inner.simulation.session.tissue().cuts().len())
+    }
+
+    /// The number of parts of the tissue: 1 if it is whole.
+    #[getter]
+    fn pieces(&self, py: Python<'_>) -> usize {
+        self.with(py, |inner| {
+            let tissue = inner.simulation.session.tissue();
+            tissue.cuts().pieces(tissue.model())
+        })
+    }
+
     /// Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None
     /// if it is.
     #[getter]

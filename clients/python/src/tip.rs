@@ -5,7 +5,8 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 /// The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
-/// `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only.
+/// `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
+/// `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
@@ -14,7 +15,8 @@ pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
 impl Tip {
     #[new]
     #[pyo3(signature = (
-        radius_m=0.005, *, friction=0.2, grasps=false, stiffness_n_per_m=None, damping_n_s_per_m=0.0, shape="disc"
+        radius_m=0.005, *, friction=0.2, grasps=false, stiffness_n_per_m=None, damping_n_s_per_m=0.0, shape="disc",
+        edge_m=None
     ))]
     fn new(
         radius_m: f64,
@@ -23,16 +25,25 @@ impl Tip {
         stiffness_n_per_m: Option<f64>,
         damping_n_s_per_m: f64,
         shape: &str,
+        edge_m: Option<[f64; 3]>,
     ) -> PyResult<Self> {
         let shape: TipShape = shape.parse().map_err(|message| PyValueError::new_err(format!("shape: {message}")))?;
+        let shape = if edge_m.is_some() { TipShape::Blade } else { shape };
         let coupling = stiffness_n_per_m.map_or(Coupling::Constraint, |stiffness_n_per_m| Coupling::Spring {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        Ok(Tip(palpate_haptics::Tip { shape, radius_m, friction, grasps, coupling, ..palpate_haptics::Tip::default() }))
+        Ok(Tip(palpate_haptics::Tip {
+            shape,
+            radius_m,
+            friction,
+            grasps,
+            coupling,
+            edge_m: edge_m.unwrap_or_default().into(),
+        }))
     }
 
-    /// The shape: disc, rigid or sphere.
+    /// The shape: disc, rigid, sphere or blade.
     #[getter]
     fn shape(&self) -> &'static str {
         self.0.shape.name()

@@ -88,6 +88,13 @@ pub struct Tip {
     pub edge_m: DVec3,
 }
 
+impl Tip {
+    /// Returns how far the tip reaches from the tool's place, m: its radius, and the length of a blade's edge.
+    pub fn reach_m(&self) -> f64 {
+        self.radius_m + self.edge_m.length()
+    }
+}
+
 impl Default for Tip {
     /// Returns the tip of a finger on wet tissue: a disc of 5 mm, μ = 0.2, no grasp, a constraint.
     fn default() -> Self {

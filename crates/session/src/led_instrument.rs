@@ -122,7 +122,7 @@ impl LedInstrument {
             let (place_m, tip) = (self.instrument.tip_m(number, &pose), self.instrument.tip(number, &pose));
             let velocity_m_per_s =
                 velocity.map(|velocity| self.instrument.tip_velocity_m_per_s(number, &pose, &velocity));
-            match is_led(shape, place_m, tip.radius_m) {
+            match is_led(shape, place_m, tip.reach_m()) {
                 true => Action::Pose { place_m, velocity_m_per_s, tip },
                 false => Action::Release,
             }

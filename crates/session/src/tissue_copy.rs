@@ -178,9 +178,9 @@ impl TissueCopy {
         let pose = self.instrument.lead(pose);
         let shape = self.session.model().shape();
         for (number, is_led_now) in self.is_led.iter_mut().enumerate() {
-            let (tip, place_m) = (self.instrument.tips[number].tip, self.instrument.tip_m(number, &pose));
+            let (tip, place_m) = (self.instrument.tip(number, &pose), self.instrument.tip_m(number, &pose));
             let tool = tool_at(number);
-            let was_led = std::mem::replace(is_led_now, self.is_single || is_led(shape, place_m, tip.radius_m));
+            let was_led = std::mem::replace(is_led_now, self.is_single || is_led(shape, place_m, tip.reach_m()));
             if *is_led_now {
                 self.due.push(led(tool, place_m, tip));
             } else if was_led {

@@ -1,5 +1,6 @@
 //! Touch: contact, force laws, and the streams of devices.
 
+mod blades;
 mod commands;
 mod contact;
 mod instruments;

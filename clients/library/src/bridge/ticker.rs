@@ -289,8 +289,10 @@ impl Ticker {
                 match &self.instrument {
                     Some(instrument) => {
                         let led = instrument.lead(&pose);
-                        let tips = instrument.tips.iter().zip(*first..).enumerate();
-                        let tips = tips.map(|(number, (of, tool))| at(tool, of.tip, instrument.tip_m(number, &led)));
+                        let tips = (*first..).take(instrument.tips.len()).enumerate();
+                        let tips = tips.map(|(number, tool)| {
+                            at(tool, instrument.tip(number, &led), instrument.tip_m(number, &led))
+                        });
                         hand.tell(tips, renderer.as_second_hand(*first, &led, now_s));
                     }
                     None => hand.tell(std::iter::once(at(*first, *tip, place_m)), None),

@@ -14,6 +14,9 @@ use crate::saved::{SavedSpring, ensure, unsound};
 use crate::shape::PointId;
 use palpate_refusal::Result;
 
+/// Versions in a snapshot are below this, so that counting on does not overflow.
+const MAX_VERSION: u32 = u32::MAX / 2;
+
 /// A severed spring.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SeveredSpring {
@@ -89,18 +92,21 @@ impl Cuts {
         let mut is_joined = vec![false; count];
         let mut joints = 0;
         for place in 0..count {
-            for spring in model.springs_at(place).filter(|spring| spring.other > place) {
+            model.each_spring(place, |spring| {
+                if spring.other < place {
+                    return;
+                }
                 is_joined[place] = true;
                 is_joined[spring.other] = true;
                 if severed.has(model.first_end(place) + spring.number) {
-                    continue;
+                    return;
                 }
                 let [one, other] = [place, spring.other].map(|place| root(&mut parents, place as u32));
                 if one != other {
                     parents[one.max(other) as usize] = one.min(other);
                     joints += 1;
                 }
-            }
+            });
         }
         (is_joined.into_iter().filter(|joined| *joined).count() - joints).max(1)
     }
@@ -147,13 +153,14 @@ impl Cuts {
 
     /// Checks saved springs and returns them; `version` is that of the topology.
     pub(crate) fn restored(saved: &[SavedSpring], version: u32, model: &Model) -> Result<Self> {
+        ensure(version < MAX_VERSION, "a version of the topology beyond what any session has")?;
         let mut severed = Severed::default();
         for SavedSpring { place, number, part, version: since } in saved.iter().copied() {
             let last = severed.springs.last().map_or(1, |last| last.version);
             ensure((last..=version).contains(&since), "a severed spring of another version of the topology")?;
             ensure((0.0..=1.0).contains(&part), "a spring severed beyond its ends")?;
             ensure((place as usize) < model.place_count(), "a severed spring at a place that the tissue lacks")?;
-            let found = model.springs_at(place as usize).find(|spring| spring.number == number as usize);
+            let found = model.springs_at(place as usize).into_iter().find(|spring| spring.number == number as usize);
             let other = found.map(|spring| spring.other).filter(|other| *other > place as usize);
             let other = other.and_then(|other| u32::try_from(other).ok());
             let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
@@ -224,8 +231,8 @@ impl Severed {
         whole.iter().for_each(|spring| self.mark(model, spring, false));
         severed.iter().for_each(|spring| self.mark(model, spring, true));
         let is_same = whole.is_empty() && severed.is_empty();
-        let version = if is_same { self.cuts.version } else { (self.cuts.version + 1).max(cuts.version) };
-        let grows_since = if is_same { self.cuts.grows_since } else { version };
+        let version = (self.cuts.version + u32::from(!is_same)).max(cuts.version);
+        let grows_since = if is_same { self.cuts.grows_since.max(cuts.grows_since) } else { version };
         self.cuts = Cuts { version, grows_since, springs: cuts.springs.clone() };
         changed
     }

@@ -24,29 +24,47 @@ pub(crate) struct SpringEnd {
 }
 
 impl Model {
-    /// Returns the springs of the point at a place in memory, by ascending number. A solid has none.
-    pub(crate) fn springs_at(&self, place: usize) -> impl Iterator<Item = SpringEnd> + '_ {
+    /// Calls `each` with the springs of the point at a place in memory, by ascending number. A solid has none.
+    #[inline]
+    pub(crate) fn each_spring(&self, place: usize, mut each: impl FnMut(SpringEnd)) {
         let springs = &self.scene.springs;
-        let bending = if springs.bending { springs.stiffness_n_per_m } else { 0.0 };
-        let stiffnesses = [springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m, bending];
-        let (point, size) = (self.point_of(place), self.points);
-        let is_sheet = matches!(self.places, Places::Sheet(_));
-        let on_grid = (0..if is_sheet { SHEET_ENDS } else { 0 }).filter_map(move |number| {
-            let ([di, dj], stiffness_n_per_m) = (ENDS[number / 4][number % 4], stiffnesses[number / 4]);
-            let [i, j] = [point[0].checked_add_signed(di)?, point[1].checked_add_signed(dj)?];
-            #[allow(clippy::cast_precision_loss)]
-            let rest = DVec3::new(di as f64, dj as f64, 0.0);
-            let other = (i < size[0] && j < size[1]).then(|| self.index_of([i, j]))?;
-            let tension_n_per_m = if number < 8 { self.prestrain * stiffness_n_per_m } else { 0.0 };
-            let spring = SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m };
-            (stiffness_n_per_m > 0.0).then_some(spring)
-        });
-        let of_mesh = self.places.joined(place).enumerate().map(move |(number, (other, rest, stiffness))| {
-            let stiffness_n_per_m = springs.stiffness_n_per_m * stiffness;
-            let tension_n_per_m = self.prestrain * stiffness_n_per_m;
-            SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m }
-        });
-        on_grid.chain(of_mesh)
+        match &self.places {
+            Places::Sheet(_) => {
+                let (along, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
+                let [i, j] = self.point_of(place);
+                // A spring of no stiffness counts too: a tissue may get another one.
+                for (kind, ends) in ENDS.iter().enumerate().take(if springs.bending { 3 } else { 2 }) {
+                    let stiffness_n_per_m = [along, shear, along][kind];
+                    let tension_n_per_m = if kind < 2 { self.prestrain * stiffness_n_per_m } else { 0.0 };
+                    for (end, [di, dj]) in ends.iter().enumerate() {
+                        // Below 0 it wraps, to beyond the last.
+                        let [i1, j1] = [i.wrapping_add_signed(*di), j.wrapping_add_signed(*dj)];
+                        if i1 >= self.points[0] || j1 >= self.points[1] {
+                            continue;
+                        }
+                        #[allow(clippy::cast_precision_loss)]
+                        let rest = DVec3::new(*di as f64, *dj as f64, 0.0);
+                        let (number, other) = (4 * kind + end, self.index_of([i1, j1]));
+                        each(SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m });
+                    }
+                }
+            }
+            Places::Surface(places) => {
+                for (number, (other, rest, stiffness)) in places.joined(place).enumerate() {
+                    let stiffness_n_per_m = springs.stiffness_n_per_m * stiffness;
+                    let tension_n_per_m = self.prestrain * stiffness_n_per_m;
+                    each(SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m });
+                }
+            }
+            Places::Solid(_) => {}
+        }
+    }
+
+    /// Returns the springs of the point at a place in memory, by ascending number. A solid has none.
+    pub(crate) fn springs_at(&self, place: usize) -> Vec<SpringEnd> {
+        let mut springs = Vec::new();
+        self.each_spring(place, |spring| springs.push(spring));
+        springs
     }
 
     /// Returns the number of the first of a place's springs, seen from there, among those of all places.

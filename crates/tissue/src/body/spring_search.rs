@@ -5,7 +5,7 @@ use glam::DVec3;
 use crate::body::model::Model;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
-use crate::kernel::region::{Marks, sides_of};
+use crate::kernel::region::{Marks, TILE, sides_of};
 
 /// The boxes around the tiles of a tissue at rest, and the length of its longest spring: what a search for springs begins with.
 #[derive(Debug)]
@@ -22,12 +22,15 @@ impl SpringSearch {
         let mut longest = 0.0_f64;
         for (tile, [least_m, most_m]) in boxes.iter_mut().enumerate() {
             for place in places_of(model, layout, tile) {
-                let mut springs = model.springs_at(place).peekable();
-                if springs.peek().is_some() {
+                let mut has_spring = false;
+                model.each_spring(place, |spring| {
+                    has_spring = true;
+                    longest = longest.max(spring.rest.length());
+                });
+                if has_spring {
                     let rest_m = model.shape().rest_m(model.point_at(place));
                     (*least_m, *most_m) = (least_m.min(rest_m), most_m.max(rest_m));
                 }
-                longest = springs.map(|spring| spring.rest.length()).fold(longest, f64::max);
             }
         }
         SpringSearch { boxes, longest_m: longest * model.unit_m }
@@ -52,16 +55,18 @@ impl SpringSearch {
             return [low_m, high_m];
         }
         let [rows, columns] = sides_of(layout, tile);
+        // A lane for each column: only then does the compiler compare a row at once.
         let bounds = |c: usize| {
-            let mut bounds = [T::default(); 2];
+            let (mut low, mut high) = ([T::default(); TILE], [T::default(); TILE]);
             for i in rows.clone() {
-                let row = c * layout.plane + i * layout.stride;
-                for value in &state.u[row + columns.start..row + columns.end] {
-                    bounds[0] = if *value < bounds[0] { *value } else { bounds[0] };
-                    bounds[1] = if *value > bounds[1] { *value } else { bounds[1] };
+                let row = &state.u[c * layout.plane + i * layout.stride..][columns.clone()];
+                for ((value, low), high) in row.iter().zip(&mut low).zip(&mut high) {
+                    *low = if *value < *low { *value } else { *low };
+                    *high = if *value > *high { *value } else { *high };
                 }
             }
-            bounds.map(Real::wide)
+            let low = low.iter().map(|value| value.wide()).fold(0.0, f64::min);
+            [low, high.iter().map(|value| value.wide()).fold(0.0, f64::max)]
         };
         let [x, y, z] = [bounds(0), bounds(1), bounds(2)];
         [low_m + model.unit_m * DVec3::new(x[0], y[0], z[0]), high_m + model.unit_m * DVec3::new(x[1], y[1], z[1])]
@@ -69,7 +74,7 @@ impl SpringSearch {
 }
 
 /// Returns the places of a tile.
-pub(crate) fn places_of(model: &Model, layout: &Layout, tile: usize) -> impl Iterator<Item = usize> + use<> {
+fn places_of(model: &Model, layout: &Layout, tile: usize) -> impl Iterator<Item = usize> + use<> {
     let ([rows, columns], across) = (sides_of(layout, tile), model.points[1]);
     rows.flat_map(move |i| columns.clone().map(move |j| i * across + j))
 }

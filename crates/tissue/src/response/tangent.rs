@@ -220,7 +220,8 @@ impl<'m> LinearPatch<'m> {
         let within = |place: u32| self.window.find(self.model, self.model.point_of(place as usize));
         let found = cuts.springs().iter().filter_map(|spring| {
             let [first, second] = spring.ends;
-            let rest = self.model.springs_at(first as usize).find(|of| of.number == spring.number as usize)?.rest;
+            let rest =
+                self.model.springs_at(first as usize).into_iter().find(|of| of.number == spring.number as usize)?.rest;
             Some(([within(first)?, within(second)?], self.model.unit_m * rest))
         });
         let mut found: Vec<([usize; 2], DVec3)> = found.collect();

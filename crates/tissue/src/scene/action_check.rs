@@ -85,7 +85,8 @@ fn check_edge(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     }
     let most_m = shape.longest_side_m();
     let range = format!("above 0 and at most {} m long, the tissue's longest side", legible(most_m));
-    number(&edge, tip.edge_m.length(), &range, |length_m| length_m > 0.0 && length_m <= most_m)?;
+    // A turned edge may be longer by rounding.
+    number(&edge, tip.edge_m.length(), &range, |length_m| length_m > 0.0 && length_m <= most_m * (1.0 + 1e-9))?;
     let refuse = |key: &str, text: &str| Err(Refusal::new(Reason::WrongKind, format!("{field}.{key}"), text));
     if tip.grasps {
         return refuse("grasps", "is for a tip that holds: a blade cuts");

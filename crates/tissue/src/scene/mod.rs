@@ -429,6 +429,10 @@ impl Scene {
 
     fn check_pretension(&self) -> Result<()> {
         let prestrain = self.prestrain();
+        if self.springs.pretension_n_per_m > 0.0 && matches!(self.body, Body::Solid(_)) {
+            let message = "is for sheets and surfaces: a solid has none";
+            return Err(Refusal::new(Reason::WrongKind, "springs.pretension_n_per_m", message));
+        }
         // NaN is not below it.
         if prestrain <= MAX_PRESTRAIN {
             return Ok(());

@@ -37,9 +37,9 @@ pub fn forces_n(profile: &InstrumentProfile, tools: &[ToolRecord]) -> impl Itera
 }
 
 /// Returns whether the tip of an instrument at a place is led: it is at most a quarter of the tissue's longest side from the
-/// tissue at rest. Farther away it would cost time and feel nothing.
-pub fn is_led(shape: &dyn RestShape, place_m: DVec3, radius_m: f64) -> bool {
-    shape.extent().distance_m(place_m) <= FAR_OF_SIDE * shape.longest_side_m() + radius_m
+/// tissue at rest, less what it reaches (`reach_m`, m: [`Tip::reach_m`](palpate_haptics::Tip::reach_m)). Farther away it would cost time and feel nothing.
+pub fn is_led(shape: &dyn RestShape, place_m: DVec3, reach_m: f64) -> bool {
+    shape.extent().distance_m(place_m) <= FAR_OF_SIDE * shape.longest_side_m() + reach_m
 }
 
 /// A script bound to a scene: what tools do over time, and what is recorded. [`Script::load`] and
@@ -109,7 +109,7 @@ impl Script {
     pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let first = self.first_tip().unwrap_or_default();
         let is_led = |profile: &PoseProfile, place_m: &DVec3| {
-            profile.mounted.is_none() || is_led(&*self.shape, *place_m, profile.tip.radius_m)
+            profile.mounted.is_none() || is_led(&*self.shape, *place_m, profile.tip.reach_m())
         };
         let place_m = move |profile: &PoseProfile, end: u64| {
             profile.at(end as f64 / self.rate_hz).filter(|place_m| is_led(profile, place_m))

@@ -17,12 +17,12 @@
 
 use glam::DVec3;
 
-use crate::body::model::{Model, Plan, displacement_m};
+use crate::body::model::displacement_m;
 use crate::body::severed::SeveredSpring;
 use crate::body::spring_ends::SpringEnd;
-use crate::body::spring_search::{SpringSearch, places_of};
-use crate::kernel::field::{Layout, State};
+use crate::body::spring_search::SpringSearch;
 use crate::kernel::real::Real;
+use crate::kernel::region::sides_of;
 use crate::stage_times::StepStage;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::Tool;
@@ -31,7 +31,7 @@ use palpate_haptics::TipShape;
 /// By what part of its way the edge begins farther back.
 const BACK: f64 = 0.05;
 
-/// A spring is found if it is at most this many times as long as the longest one at rest.
+/// A spring is found if it is, with its way in a step, at most this many times as long as the longest one at rest.
 const MAX_STRETCH: f64 = 4.0;
 
 /// The way of a blade's edge in a step: tip and heel at its beginning and its end, m.
@@ -90,7 +90,7 @@ struct Crossing {
 }
 
 impl<T: Real> TissueState<T> {
-    /// Prepares the search for springs, if a tool has a blade.
+    /// Prepares the search for springs that blades cross, once.
     pub(super) fn prepare_to_cut(&mut self) {
         if self.spring_search.is_none() {
             let tiles = self.tiles.tile_count();
@@ -124,49 +124,82 @@ impl<T: Real> TissueState<T> {
     fn crossed(&self, sweep: &EdgeSweep) -> Vec<Crossing> {
         let TissueState { model, plan, tables, state, tiles, spring_search, .. } = self;
         let (Some(search), mut found) = (spring_search, Vec::new()) else { return Vec::new() };
-        let layout = &tables.layout;
-        let reach_m = DVec3::splat(0.5 * MAX_STRETCH * search.longest_m());
+        let (layout, across) = (&tables.layout, model.points[1]);
         let [least_m, most_m] = sweep.bounds_m();
-        let [least_m, most_m] = [least_m - reach_m, most_m + reach_m];
-        let is_within = |place_m: DVec3| place_m.cmpge(least_m).all() && place_m.cmple(most_m).all();
-        let displacement_m = |place: usize| displacement_m(model, layout, state, model.point_of(place));
+        let reach_m = DVec3::splat(0.5 * MAX_STRETCH * search.longest_m());
+        let is_near = |place_m: DVec3| place_m.cmpge(least_m - reach_m).all() && place_m.cmple(most_m + reach_m).all();
+        let ways = f64::from(plan.substeps) * model.unit_m;
+        // Displacement, and way in this step.
+        let motion = |place: usize| {
+            let at = place / across * layout.stride + place % across;
+            let vector = |field: &[T]| {
+                let component = |c: usize| field[c * layout.plane + at].wide();
+                DVec3::new(component(0), component(1), component(2))
+            };
+            (model.unit_m * vector(&state.u), ways * vector(&state.d))
+        };
         for tile in 0..tiles.tile_count() {
             let [low_m, high_m] = search.tile_box_m(model, layout, state, &tiles.moved, tile);
-            if high_m.cmplt(least_m).any() || low_m.cmpgt(most_m).any() {
+            if high_m.cmplt(least_m - reach_m).any() || low_m.cmpgt(most_m + reach_m).any() {
                 continue;
             }
-            for place in places_of(model, layout, tile) {
-                let mut springs = model.springs_at(place).peekable();
-                if springs.peek().is_none() {
-                    continue;
-                }
-                let (rest_m, u_m) = (model.shape().rest_m(model.point_at(place)), displacement_m(place));
-                if !is_within(rest_m + u_m) {
-                    continue;
-                }
-                for spring in springs {
-                    if tables.severed.has(model.first_end(place) + spring.number) {
-                        continue;
-                    }
-                    let (first, spring) = if spring.other > place {
-                        (place, spring)
-                    } else {
-                        let number = model.number_at_other_end(place, spring.number);
-                        (spring.other, SpringEnd { number, other: place, rest: -spring.rest, ..spring })
-                    };
-                    let [own_m, other_m] = [first, spring.other].map(displacement_m);
-                    let span_m = model.unit_m * spring.rest + (other_m - own_m);
-                    let from_m = if first == place { rest_m + u_m } else { rest_m + u_m - span_m };
-                    let moved_m = 0.5
-                        * (moved_m(model, plan, layout, state, first)
-                            + moved_m(model, plan, layout, state, spring.other));
-                    if let Some(part) = sweep.crosses(from_m, span_m, moved_m) {
-                        found.push(Crossing { place: first, spring, part });
-                    }
+            let [rows, columns] = sides_of(layout, tile);
+            // Plain loops: iterators over both are not inlined.
+            for i in rows {
+                for j in columns.clone() {
+                    self.crossed_at(i * across + j, sweep, &is_near, &motion, &mut found);
                 }
             }
         }
         found
+    }
+
+    /// Adds the springs of a place that a blade crosses, if the place is near it.
+    #[inline]
+    fn crossed_at(
+        &self,
+        place: usize,
+        sweep: &EdgeSweep,
+        is_near: &impl Fn(DVec3) -> bool,
+        motion: &impl Fn(usize) -> (DVec3, DVec3),
+        found: &mut Vec<Crossing>,
+    ) {
+        let TissueState { model, tables, .. } = self;
+        let (u_m, way_m) = motion(place);
+        let place_m = model.shape().rest_m(model.point_at(place)) + u_m;
+        if !is_near(place_m) {
+            return;
+        }
+        let [least_m, most_m] = sweep.bounds_m();
+        let first_end = model.first_end(place);
+        model.each_spring(place, |spring| {
+            let (other_u_m, other_way_m) = motion(spring.other);
+            let span_m = model.unit_m * spring.rest + (other_u_m - u_m);
+            // The other end finds it too.
+            if spring.other < place && is_near(place_m + span_m) {
+                return;
+            }
+            let moved_m = 0.5 * (way_m + other_way_m);
+            let (low_m, high_m) = (span_m.min(DVec3::ZERO), span_m.max(DVec3::ZERO));
+            let slack_m = moved_m.abs();
+            if (place_m + high_m + slack_m).cmplt(least_m).any() || (place_m + low_m - slack_m).cmpgt(most_m).any() {
+                return;
+            }
+            if tables.severed.has(first_end + spring.number) {
+                return;
+            }
+            // Named by its first end.
+            let (first, first_m, spring, span_m) = if spring.other > place {
+                (place, place_m, spring, span_m)
+            } else {
+                let number = model.number_at_other_end(place, spring.number);
+                let spring = SpringEnd { number, other: place, rest: -spring.rest, ..spring };
+                (spring.other, place_m + span_m, spring, -span_m)
+            };
+            if let Some(part) = sweep.crosses(first_m, span_m, moved_m) {
+                found.push(Crossing { place: first, spring, part });
+            }
+        });
     }
 
     /// Severs a spring. Returns whether it was whole.
@@ -210,13 +243,6 @@ impl<T: Real> TissueState<T> {
         }
         true
     }
-}
-
-/// Returns the way of a point in the present step, m, by its velocity at the end.
-fn moved_m<T: Real>(model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, place: usize) -> DVec3 {
-    let at = layout.offset(place);
-    let component = |c: usize| state.d[c * layout.plane + at].wide();
-    f64::from(plan.substeps) * model.unit_m * DVec3::new(component(0), component(1), component(2))
 }
 
 #[cfg(test)]

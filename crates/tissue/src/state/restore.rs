@@ -104,6 +104,8 @@ impl Model {
             scene.stepping.rate_hz,
             self.plan.substep_s,
             self.prestrain,
+            scene.cutting.toughness_j_per_m2,
+            scene.cutting.thickness_m.unwrap_or(-1.0),
             self.sleep_tolerance,
         ] {
             add(&value.to_bits().to_le_bytes());

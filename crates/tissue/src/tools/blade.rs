@@ -37,7 +37,7 @@ impl Tool {
         let place_m = self.place_m(fraction);
         let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
         let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
-        if self.contact_state == ContactState::Free {
+        if self.contact_state == ContactState::Free && plan.is_first(fraction) {
             self.seek(model, layout, state, place_m, plan.is_first(fraction));
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));

@@ -188,7 +188,8 @@ impl Contacts {
             }
             if is_other || tool.tip.grasps != tip.grasps {
                 (tool.contact_state, tool.steady_n, tool.is_new) = (ContactState::Free, DVec3::ZERO, true);
-                tool.from_edge_m = tip.edge_m;
+                (tool.from_m, tool.from_edge_m) =
+                    (if tip.edge_m == DVec3::ZERO { tool.from_m } else { to_m }, tip.edge_m);
             }
             tool.rigid.iter_mut().for_each(|rigid| rigid.set_friction(tip.friction));
             (tool.to_m, tool.tip) = (to_m, tip);

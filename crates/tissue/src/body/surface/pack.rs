@@ -153,12 +153,13 @@ impl<T: Real> MeshSprings<T> {
         let half = &slots.springs(slot)[number];
         let values = coefficients::<T>(half);
         let stiffness = STIFFNESS * self.shape.lanes;
+        let is_right_stiffness =
+            |stiffness: T| if is_severed { stiffness == values[STIFFNESS] } else { stiffness == T::default() };
         let set = |row: &mut [T], lane: usize| {
             let lanes = row.len() / COEFFICIENTS;
             let is_this = (0..STIFFNESS).all(|which| row[which * lanes + lane] == values[which]);
-            // Several springs may join the same points: one that is whole, or one that is severed.
-            let was_severed = row[stiffness + lane] == T::default();
-            let is_found = is_this && was_severed != is_severed;
+            // Several springs may join the same points: one that is whole and as stiff, or one that is severed.
+            let is_found = is_this && is_right_stiffness(row[stiffness + lane]);
             if is_found {
                 row[stiffness + lane] = if is_severed { T::default() } else { values[STIFFNESS] };
             }
@@ -171,17 +172,27 @@ impl<T: Real> MeshSprings<T> {
                 set(&mut rows.coefficients[row * length..][..length], slot % self.shape.lanes);
             }
             Arrangement::Halo(halo) => {
-                let Halo { firsts, parts, coefficients, owners, .. } = halo;
+                let Halo { firsts, parts, coefficients, owners, others, .. } = halo;
                 let [from, to] = [0, 1].map(|next| firsts[slot / BLOCK + next] as usize);
-                let lane = slot % BLOCK;
-                for part in &parts[from..to] {
+                let (lane, other, outside) = (slot % BLOCK, half.to as usize, slots.outside(slot / BLOCK));
+                for (number, part) in parts[from..to].iter().enumerate() {
+                    let around = outside.chunks(HALO).nth(number).unwrap_or_default();
+                    // The lane of the other end, as `Packing::push_row` names it.
+                    let named = match around.binary_search(&half.to) {
+                        _ if other / BLOCK == slot / BLOCK => other % BLOCK,
+                        Ok(at) => BLOCK + halo_lane(at, part.halves as usize),
+                        Err(_) => continue,
+                    };
                     let first = part.row as usize;
                     for row in 0..(part.plain + part.packed) as usize {
                         let values = &mut coefficients[(first + row) * length..][..length];
                         let packed = row.checked_sub(part.plain as usize);
+                        let ends = &others[first + row];
                         let is_found = match packed.map(|packed| &owners[part.first_packed as usize + packed]) {
-                            None => set(values, lane),
-                            Some(owners) => (0..BLOCK).any(|n| owners.lane(n) == lane && set(values, n)),
+                            None => ends.lane(lane) == named && set(values, lane),
+                            Some(owners) => {
+                                (0..BLOCK).any(|n| owners.lane(n) == lane && ends.lane(n) == named && set(values, n))
+                            }
                         };
                         if is_found {
                             return;

@@ -1,0 +1,111 @@
+//! Blades over a real server: one pose leads a blade, the session tells what is severed, and a snapshot in mid-cut continues.
+
+use crate::common::server::{TestServer, TestTouch, open};
+use glam::{DQuat, DVec3};
+use palpate_haptics::{Instrument, InstrumentPose, Tip, TipShape};
+use palpate_proto::geometry::from_vector;
+use palpate_proto::pb::command::Action;
+use palpate_proto::{instrument, pb};
+use palpate_tissue::select::scheme_selection::NEVER;
+
+const STEPS: u64 = 400;
+
+/// A blade with an edge of 20 mm.
+fn knife() -> Instrument {
+    let edge_m = -0.02 * DVec3::X;
+    Instrument::of_tip(Tip { shape: TipShape::Blade, radius_m: 0.001, edge_m, ..Tip::default() })
+}
+
+/// Along `liver`, 5 mm deep, the edge upright.
+fn pose_at(step: u64) -> InstrumentPose {
+    let y = 0.02 + 0.03 * step as f64 / STEPS as f64;
+    let pose = InstrumentPose {
+        place_m: DVec3::new(0.03625, y, -0.005),
+        orientation: DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2),
+        jaw_rad: 0.0,
+    };
+    instrument::from_pose(&instrument::pose(&pose), &knife()).unwrap().0
+}
+
+async fn create(server: &TestServer, source: pb::create_session_request::Source) -> String {
+    let request = pb::CreateSessionRequest { source: Some(source), paused: true, ..Default::default() };
+    server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id
+}
+
+async fn topology(server: &TestServer, session_id: &str, since_version: u32) -> pb::GetTopologyResponse {
+    let request = pb::GetTopologyRequest { session_id: session_id.to_owned(), since_version };
+    let mut parts = server.views().await.get_topology(request).await.unwrap().into_inner();
+    let mut whole = pb::GetTopologyResponse::default();
+    while let Some(part) = parts.message().await.unwrap() {
+        assert!(!whole.last);
+        whole.severed.extend(part.severed.iter().copied());
+        whole = pb::GetTopologyResponse { severed: std::mem::take(&mut whole.severed), ..part };
+    }
+    assert!(whole.last);
+    whole
+}
+
+/// Sends the commands of some steps and lets them pass.
+async fn lead(server: &TestServer, session: &str, touch: &mut TestTouch, steps: std::ops::Range<u64>) {
+    for step in steps.clone() {
+        let action = Some(Action::Instrument(instrument::pose(&pose_at(step))));
+        let sequence = Some(step + 1);
+        touch.command(pb::Command { tool: 0, sequence, at_step: Some(step), action, ..Default::default() }).await;
+    }
+    touch.settle().await;
+    server.start_until(session, steps.end).await;
+    touch.sample_with(|sample| sample.step == steps.end).await;
+}
+
+#[tokio::test]
+async fn a_session_tells_what_a_blade_has_severed_and_a_snapshot_in_mid_cut_continues() {
+    let server = TestServer::start(&[]);
+    let session = create(&server, pb::create_session_request::Source::SceneName("liver".into())).await;
+    let with_knife =
+        |session: &str| pb::TouchOpen { instruments: vec![instrument::instrument(&knife(), 0)], ..open(session, &[0]) };
+    let mut touch = TestTouch::open(&server, with_knife(&session)).await.unwrap();
+    assert_eq!(topology(&server, &session, 0).await.pieces, 1);
+    lead(&server, &session, &mut touch, 0..STEPS / 2).await;
+    let half = topology(&server, &session, 0).await;
+    assert!(half.version > 5 && half.severed.len() > 10, "{half:?}");
+    let request = pb::SaveSnapshotRequest { session_id: session.clone() };
+    let parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
+    let bytes = palpate_client::snapshot::collect(parts).await.unwrap();
+    let reader = palpate_session::journal::JournalReader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
+    let limits = palpate_tissue::limits::Limits::default();
+    let (saved, _) = palpate_session::journal::session_at(reader, &limits, STEPS / 2, &NEVER).unwrap();
+    assert_eq!(saved.tissue().cuts().len(), half.severed.len());
+    let hash = server.hash_at(&session, STEPS / 2).await;
+    assert_eq!(format!("{:032x}", saved.tissue().state_hash()), hash);
+    lead(&server, &session, &mut touch, STEPS / 2..STEPS).await;
+    // Each part of the list continues the one before.
+    let (all, later) = (topology(&server, &session, 0).await, topology(&server, &session, half.version).await);
+    assert!(later.continues && later.version == all.version);
+    let known: Vec<_> = half.severed.iter().chain(&later.severed).copied().collect();
+    assert_eq!(known, all.severed);
+    let status = server.status(&session).await;
+    assert_eq!((status.topology_version, status.severed as usize, status.pieces), (all.version, known.len(), 1));
+    for spring in &all.severed {
+        let place_m = from_vector(spring.rest_m.as_ref());
+        assert!((place_m.x - 0.03625).abs() < 2e-4 && (0.019..0.051).contains(&place_m.y), "{place_m}");
+        let rows = [spring.first_vertex, spring.second_vertex].map(|vertex| vertex.unwrap() / 31);
+        assert!(rows[0] != rows[1] && spring.version <= all.version, "{spring:?}");
+    }
+    let bytes = prost::Message::encoded_len(&all);
+    assert!(bytes < 100 * all.severed.len(), "{bytes} bytes for {} springs", all.severed.len());
+}
+
+#[tokio::test]
+async fn a_blade_that_cannot_cut_is_refused_with_its_field() {
+    let server = TestServer::start(&[]);
+    let solid = create(&server, pb::create_session_request::Source::SceneName("liver-solid".into())).await;
+    let liver = create(&server, pb::create_session_request::Source::SceneName("liver".into())).await;
+    let mut long = knife();
+    long.tips[0].tip.edge_m = 10.0 * DVec3::X;
+    for (session, knife, field) in [(&solid, knife(), "shape"), (&liver, long, "edge_m")] {
+        let open = pb::TouchOpen { instruments: vec![instrument::instrument(&knife, 0)], ..open(session, &[0]) };
+        let Err(refused) = TestTouch::open(&server, open).await else { panic!("{field} was accepted") };
+        let (_, _, message) = crate::common::server::told(&refused);
+        assert!(message.contains(field) || format!("{refused:?}").contains(field), "{refused:?}");
+    }
+}
