@@ -251,7 +251,7 @@ fn instruments_that_nothing_can_be_are_refused_with_their_place() {
     let of = |instrument: &str| format!("duration_s = 1\nsample_every_s = 1\n[[instrument]]\n{instrument}\n");
     let tip = "tips = [{ radius_m = 0.004 }]";
     for (text, expected) in [
-        (of(pose), "instrument[0]: must have `tips`, a `shaft` or `jaws`"),
+        (of(pose), "instrument[0]: must have `tips`, a `shaft`, `jaws`, `scissors` or a `blade`"),
         (of(&format!("{tip}\nposes = []")), "instrument[0].poses: must have at least one pose"),
         (of(&format!("{tip}\n{pose}\nuntil_s = 0")), "instrument[0].until_s: must be later than the first pose"),
         (

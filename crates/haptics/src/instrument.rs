@@ -28,6 +28,9 @@ pub const MAX_TIPS: usize = 64;
 /// | 4.2 %, with which it is as thick in the mean | 0, 3, 5, −1 % |
 pub const BETWEEN_SPHERES: f64 = 0.035;
 
+/// By which part of their length the edges of closed scissors have passed each other: what lies between them is cut.
+pub const PASSED: f64 = 0.02;
+
 /// What of an instrument a tip belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum InstrumentPart {
@@ -83,10 +86,10 @@ impl Instrument {
         Instrument { tips: vec![tip], ..Instrument::default() }
     }
 
-    /// Adds jaws that end at the origin, and a shaft behind them, each with its length, m, and its tip. Closed jaws of spheres touch
+    /// Adds jaws that end at the origin, and a shaft behind them or behind scissors, each with its length, m, and its tip. Closed jaws of spheres touch
     /// each other; discs lie on the tissue, so that those of both jaws lie on the instrument's axis.
     pub fn add_parts(&mut self, jaws: Option<(f64, Tip)>, shaft: Option<(f64, Tip)>) {
-        let mut from_m = DVec3::ZERO;
+        let mut from_m = self.hinge_m;
         if let Some((length_m, tip)) = jaws {
             self.hinge_m = -length_m * DVec3::X;
             from_m = self.hinge_m;
@@ -99,6 +102,16 @@ impl Instrument {
         }
         if let Some((length_m, tip)) = shaft {
             self.add_row(from_m, from_m - length_m * DVec3::X, tip, InstrumentPart::Body);
+        }
+    }
+
+    /// Adds the jaws of scissors, which end at the origin: a blade on each, `length_m` (m) long, from the hinge on. The tip `blade` gives radius
+    /// and friction. When the jaws are closed, the edges have passed each other by [`PASSED`] of their length.
+    pub fn add_scissors(&mut self, length_m: f64, blade: Tip) {
+        self.hinge_m = -length_m * DVec3::X;
+        let tip = Tip { shape: TipShape::Blade, edge_m: -length_m * DVec3::X, ..blade };
+        for (part, side) in [(InstrumentPart::UpperJaw, 1.0), (InstrumentPart::LowerJaw, -1.0)] {
+            self.tips.push(InstrumentTip { offset_m: -side * PASSED * length_m * DVec3::Y, tip, part });
         }
     }
 

@@ -556,6 +556,10 @@ impl Binding<'_> {
                 Ok(InstrumentTip { offset_m, tip, part: InstrumentPart::Body })
             })?);
         }
+        if let Some(scissors) = fields.item("scissors") {
+            let blade = blade_of(&scissors, shape)?;
+            instrument.add_scissors(blade.edge_m.length(), blade);
+        }
         let mut part = |key: &'static str| {
             let Some(part) = fields.item(key) else { return Ok(None) };
             let of_part = part.table(|fields| {
@@ -565,9 +569,12 @@ impl Binding<'_> {
             of_part.map(Some)
         };
         let (jaws, shaft) = (part("jaws")?, part("shaft")?);
+        if jaws.is_some() && instrument.has_jaws() {
+            return Err(item.refuse(Reason::WrongKind, "has `jaws` and `scissors`: an instrument has one pair"));
+        }
         instrument.add_parts(jaws, shaft);
         if instrument.tips.is_empty() {
-            return Err(item.refuse(Reason::Missing, "must have `tips`, a `shaft`, `jaws` or a `blade`"));
+            return Err(item.refuse(Reason::Missing, "must have `tips`, a `shaft`, `jaws`, `scissors` or a `blade`"));
         }
         if instrument.tips.len() > MAX_TIPS {
             let message = format!(

@@ -116,6 +116,8 @@ impl<T: Real> TissueState<T> {
         }
         if any {
             self.tables.severed.begin_version(version);
+            // A twin that steps otherwise severs other springs: that is no error of the stepping.
+            self.audit_window.give_up();
         }
         self.ended(StepStage::Contact);
     }

@@ -256,3 +256,31 @@ fn a_blade_pushes_first_and_then_cuts_with_the_work_of_separation() {
     tissue.step().unwrap();
     assert_eq!(tissue.tool_contact(0).unwrap().force_on_tool_n, DVec3::ZERO);
 }
+
+#[test]
+fn scissors_cut_what_lies_between_their_edges_when_they_close() {
+    let model = sheet(&["stepping.precision=f64"]);
+    let text = "duration_s = 0.3\nsample_every_s = 0.1\n[[instrument]]\nscissors = { length_m = 0.03 }\n\
+                poses = [{ at_s = 0.0, place_m = [0.0976, 0.1, 0.0], orientation = [0.5, 0.5, 0.5, 0.5], jaw_rad = 0.6 },\n\
+                { at_s = 0.2, place_m = [0.0976, 0.1, 0.0], orientation = [0.5, 0.5, 0.5, 0.5] }]\n";
+    let folder = std::path::Path::new("scripts");
+    let script = crate::scene::script::Script::parse("test", text, folder, &model.scene, &Limits::default()).unwrap();
+    let mut tissue = at_rest(&model);
+    let mut severed_at = [0; 2];
+    for step in 0..300 {
+        for (tool, action) in script.poses_at(step) {
+            let crate::scene::script::Action::Pose { place_m, tip, .. } = action else { panic!("{action:?}") };
+            tissue.pose(tool, place_m, tip);
+        }
+        tissue.step().unwrap();
+        severed_at[usize::from(step > 150)] = tissue.cuts().len();
+    }
+    // It points along y: from its hinge, 30 mm behind the ends of the jaws.
+    let joints = tissue.cuts().joints(&model);
+    assert!(joints.len() > 8 && severed_at[0] < joints.len(), "{severed_at:?}");
+    for joint in joints {
+        let [a_m, b_m] = joint.points.map(|point| model.shape().rest_m(point));
+        let place_m = a_m.lerp(b_m, joint.part);
+        assert!((place_m.x - 0.0976).abs() < 1e-3 && (0.065..0.105).contains(&place_m.y), "{place_m}");
+    }
+}
