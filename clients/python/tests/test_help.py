@@ -72,7 +72,8 @@ class Help(unittest.TestCase):
             (palpate.Session.step, "(self, /, steps=1)"),
             (
                 palpate.Tip,
-                "(radius_m=0.005, *, friction=0.2, grasps=False, stiffness_n_per_m=None, damping_n_s_per_m=0.0, shape='disc')",
+                "(radius_m=0.005, *, friction=0.2, grasps=False, stiffness_n_per_m=None, damping_n_s_per_m=0.0, "
+                "shape='disc', edge_m=None)",
             ),
             (palpate.Client.load, "(self, /, plan, *, report=None)"),
         ]:

@@ -284,3 +284,17 @@ fn scissors_cut_what_lies_between_their_edges_when_they_close() {
         assert!((place_m.x - 0.0976).abs() < 1e-3 && (0.065..0.105).contains(&place_m.y), "{place_m}");
     }
 }
+
+#[test]
+fn a_wound_that_gapes_without_any_damping_does_not_look_like_energy_from_nowhere() {
+    for integrator in ["exponential2", "central"] {
+        let integrator = format!("stepping.integrator={integrator}");
+        let model = tense(61, &["damping.coefficient_n_s_per_m=0", &integrator]);
+        let mut tissue = at_rest(&model);
+        let low = |y: f64| DVec3::new(0.0305, y, -0.01);
+        cut(&mut *tissue, low(0.0245), low(0.0355), 400);
+        (0..4000).for_each(|_| tissue.step().unwrap());
+        assert_eq!(tissue.guard_events(), 0);
+        assert!(tissue.largest_displacement_m() > 1e-5, "{} m", tissue.largest_displacement_m());
+    }
+}
