@@ -23,7 +23,7 @@ impl TopologyParts {
         let (cuts, model) = (&status.cuts, &status.model);
         let continues = cuts.continues(since_version);
         let is_new = |joint: &SeveredJoint| !continues || joint.version > since_version;
-        let shows_points = handle.skin.as_ref().is_none_or(|skin| skin.shows_points());
+        let shows_points = handle.skin.as_ref().is_none_or(|skin| !skin.is_bound());
         let springs: Vec<_> = cuts
             .joints(model)
             .iter()

@@ -152,13 +152,8 @@ impl Skin {
         (tables + uv + bound + size_of_val(&*self.rest_m)) as u64
     }
 
-    /// Returns whether the shown vertices are the simulated points.
-    pub fn shows_points(&self) -> bool {
-        !self.is_bound()
-    }
-
     /// Returns whether the shown vertices differ from the simulated ones.
-    pub(super) fn is_bound(&self) -> bool {
+    pub fn is_bound(&self) -> bool {
         !self.bound.is_empty() || !self.in_cells.is_empty()
     }
 

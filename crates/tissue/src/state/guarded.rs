@@ -23,7 +23,7 @@ use std::sync::Arc;
 
 use crate::audit_window::{AuditWindow, Mark, SharedCheckpoint, WindowInputs};
 use crate::body::Places;
-use crate::body::model::{Model, displacement_m};
+use crate::body::model::{Model, Plan, displacement_m};
 use crate::body::severed::SeveredSpring;
 use crate::body::solid::is_inverted;
 use crate::body::tables::springs_of;
@@ -229,20 +229,18 @@ impl<T: Real> TissueState<T> {
     /// Converts the state from the substep of `was` halvings to that of `halvings`.
     pub(super) fn halve(&mut self, was: u32, halvings: u32) {
         let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
-        let springs = springs_of(&self.model, &was);
-        let volume_change = self.volume_change();
-        convert(
-            &self.tables.layout,
-            (&springs, &self.tables.severed),
-            [&was, &plan],
-            &self.applied,
-            volume_change,
-            &mut self.state,
-        );
-        self.known_volume_change.set(None);
-        self.applied.forget();
+        self.convert_state(&was, &plan);
         self.tables.springs = springs_of(&self.model, &plan);
         (self.halvings, self.plan) = (halvings, plan);
+    }
+
+    /// Converts the state from one plan to another of the same scheme.
+    fn convert_state(&mut self, was: &Plan, plan: &Plan) {
+        let springs = (&springs_of(&self.model, was), &self.tables.severed);
+        let volume_change = self.volume_change();
+        convert(&self.tables.layout, springs, [was, plan], &self.applied, volume_change, &mut self.state);
+        self.known_volume_change.set(None);
+        self.applied.forget();
     }
 
     pub(super) fn input(&mut self, tool: usize, input: ToolInput) {
@@ -474,18 +472,7 @@ impl<T: Real> TissueState<T> {
         let (was, plan) = (self.plan.clone(), model.plan.clone());
         // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
         self.applied.terms = self.present_terms();
-        let springs = springs_of(&self.model, &was);
-        let volume_change = self.volume_change();
-        convert(
-            &self.tables.layout,
-            (&springs, &self.tables.severed),
-            [&was, &plan],
-            &self.applied,
-            volume_change,
-            &mut self.state,
-        );
-        self.known_volume_change.set(None);
-        self.applied.forget();
+        self.convert_state(&was, &plan);
         self.model = model.clone();
         self.tables.springs = springs_of(model, &plan);
         self.plan = plan;
