@@ -364,11 +364,6 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         false
     }
 
-    /// Returns whether blades can cut it.
-    fn takes_blades(&self) -> bool {
-        !self.takes_rigid_tips()
-    }
-
     /// Returns whether the normal of every point is +z, so that z alone tells how far a point was pressed.
     fn faces_up(&self) -> bool {
         false

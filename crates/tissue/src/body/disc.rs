@@ -1,9 +1,11 @@
 //! The interface of a disc on a kind of tissue: the area over which a tool's tip touches it.
 
 use std::fmt;
+use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::saved::SavedPlace;
 use crate::shape::{CellPlace, PointId};
 use palpate_refusal::Result;
@@ -17,6 +19,22 @@ pub(crate) struct SurfaceSample {
     pub(crate) outward: DVec3,
     pub(crate) area_m2: f64,
     pub(crate) cell: CellPlace,
+    /// The copies of the cell's corners with which it moves, by their places; `None` without cuts beside it.
+    pub(crate) copies: Option<[u32; 8]>,
+}
+
+/// A point that a disc covers.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct DiscPoint {
+    pub(crate) point: PointId,
+    /// The place of the copy of the point that it covers, if a cut has doubled the point.
+    pub(crate) copy: Option<usize>,
+}
+
+impl From<PointId> for DiscPoint {
+    fn from(point: PointId) -> Self {
+        DiscPoint { point, copy: None }
+    }
 }
 
 /// The disc of a tool on a kind of tissue, at a place of the rest surface. `body::footprint` asks it which points it
@@ -93,7 +111,10 @@ pub(crate) trait TissueDisc: fmt::Debug + Send + Sync {
         None
     }
 
+    /// Lets the disc move with these copies of a solid's corners.
+    fn follow_copies(&mut self, _copies: Option<&Arc<CornerCopies>>) {}
+
     /// Calls `add` with each covered point, its weight w and ∂w/∂c, the derivative by the place, 1/m; each point once. The
     /// weights add up to 1.
-    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2));
+    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2));
 }

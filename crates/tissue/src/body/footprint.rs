@@ -13,11 +13,14 @@
 //! chosen so that A is that of the requested disc: on a sheet in the mean over places
 //! (`body::sheet::footprint`), on a mesh at each place (`palpate_geometry::surface`).
 
+use std::sync::Arc;
+
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::body::disc::{SurfaceSample, TissueDisc};
+use crate::body::disc::{DiscPoint, SurfaceSample, TissueDisc};
 use crate::body::disc_on;
 use crate::body::model::Model;
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::saved::{SavedPlace, ensure};
 use palpate_refusal::Result;
 
@@ -37,6 +40,8 @@ const BESIDE: f64 = 1.0 / 256.0;
 pub struct Footprint {
     radius_m: f64,
     disc: Box<dyn TissueDisc>,
+    /// The corners of a solid that cuts have doubled.
+    copies: Option<Arc<CornerCopies>>,
     reached: Vec<WeightedNode>,
     /// Factor of the weights of movable points ([`MIN_FREE_PART`]).
     free_factor: f64,
@@ -49,7 +54,7 @@ pub struct Footprint {
 
 impl Clone for Footprint {
     fn clone(&self) -> Self {
-        Footprint { disc: self.disc.boxed(), reached: self.reached.clone(), ..*self }
+        Footprint { disc: self.disc.boxed(), copies: self.copies.clone(), reached: self.reached.clone(), ..*self }
     }
 }
 
@@ -83,6 +88,7 @@ impl Footprint {
         Footprint {
             radius_m,
             disc: disc_on(&model.scene.body, radius_m),
+            copies: None,
             reached: Vec::new(),
             free_factor: 1.0,
             rest_m: DVec3::ZERO,
@@ -102,6 +108,32 @@ impl Footprint {
         footprint.disc.restore(saved)?;
         footprint.lay(model);
         ensure(footprint.is_sound(), "a tool that is nowhere on the tissue")?;
+        Ok(footprint)
+    }
+
+    /// Lets the disc move with these copies of a solid's corners; with `None` it keeps the points that it covers until it moves.
+    pub(crate) fn follow_cuts(&mut self, model: &Model, copies: Option<&Arc<CornerCopies>>) {
+        self.copies = copies.cloned();
+        self.disc.follow_copies(copies);
+        if copies.is_some() {
+            self.lay(model);
+        }
+    }
+
+    /// Returns the corner of a solid of which a place in memory has a copy; the place itself for any other.
+    pub(crate) fn corner_of(&self, index: usize) -> usize {
+        self.copies.as_ref().map_or(index, |copies| copies.corner_of(index))
+    }
+
+    /// Returns the relative mass at a place in memory, after cuts.
+    pub(crate) fn mass_at(&self, model: &Model, index: usize) -> f64 {
+        mass_at(model, self.copies.as_deref(), index)
+    }
+
+    /// Returns a disc at a saved place with the copies of this one.
+    pub(crate) fn at_saved(&self, model: &Model, saved: &SavedPlace) -> Result<Self> {
+        let mut footprint = Self::restored(model, self.radius_m, saved)?;
+        footprint.follow_cuts(model, self.copies.as_ref());
         Ok(footprint)
     }
 
@@ -186,13 +218,14 @@ impl Footprint {
 
     /// Takes over the points that the disc covers.
     fn lay(&mut self, model: &Model) {
-        let Footprint { disc, reached, rest_m, along, .. } = self;
+        let Footprint { disc, copies, reached, rest_m, along, .. } = self;
         let is_flat = disc.is_flat();
         reached.clear();
         (*rest_m, *along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
-        disc.cover(&mut |point, weight, gradient| {
-            let index = model.place_of(point);
-            let (free, mass) = (is_free(model, index), model.relative_mass_at(index));
+        disc.cover(&mut |DiscPoint { point, copy }, weight, gradient| {
+            let free = is_free(model, model.place_of(point));
+            let index = copy.unwrap_or_else(|| model.place_of(point));
+            let mass = mass_at(model, copies.as_deref(), index);
             reached.push(WeightedNode { point: model.point_of(index), free, mass, weight, gradient });
             if !is_flat {
                 let at_m = model.shape().rest_m(point);
@@ -234,6 +267,7 @@ impl Footprint {
         }
         let of_fixed = (1.0 - MIN_FREE_PART) / (1.0 - part);
         (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
+        let copies = &self.copies;
         for point in &mut self.reached {
             let (factor, by) = if point.free {
                 (self.free_factor, -self.free_factor / part * change)
@@ -242,7 +276,9 @@ impl Footprint {
             };
             point.gradient = factor * point.gradient + point.weight * by;
             point.weight *= factor;
-            let rest_m = model.shape().rest_m(model.point_at(model.index_of(point.point)));
+            let index = model.index_of(point.point);
+            let corner = copies.as_ref().map_or(index, |copies| copies.corner_of(index));
+            let rest_m = model.shape().rest_m(model.point_at(corner));
             self.rest_m += point.weight * rest_m;
             self.along[0] += point.gradient.x * rest_m;
             self.along[1] += point.gradient.y * rest_m;
@@ -344,6 +380,14 @@ pub struct RestSurface {
     /// The change of the normal per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R seen from
     /// outside, −1/R from inside. Valid for displacements perpendicular to the normal.
     pub curvature_per_m: DMat3,
+}
+
+/// Returns the relative mass at a place in memory, after cuts.
+pub(crate) fn mass_at(model: &Model, copies: Option<&CornerCopies>, index: usize) -> f64 {
+    match (copies, model.places.solid()) {
+        (Some(copies), Some(places)) => copies.mass(places, index),
+        _ => model.relative_mass_at(index),
+    }
 }
 
 fn is_free(model: &Model, index: usize) -> bool {

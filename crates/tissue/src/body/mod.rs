@@ -64,7 +64,7 @@ pub(crate) enum Places {
     Sheet(SheetPoints),
     /// Points in any arrangement, as of a mesh, and their springs.
     Surface(Arc<MeshPlaces>),
-    /// The corners of the cubes of a solid.
+    /// The corners of the cubes of a solid, and spare places.
     Solid(Arc<SolidPlaces>),
 }
 
@@ -111,7 +111,7 @@ impl Places {
     }
 
     /// Returns what a solid has, if the tissue is one.
-    fn solid(&self) -> Option<&SolidPlaces> {
+    pub(crate) fn solid(&self) -> Option<&Arc<SolidPlaces>> {
         if let Places::Solid(places) = self { Some(places) } else { None }
     }
 

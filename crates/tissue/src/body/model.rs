@@ -311,23 +311,28 @@ impl Model {
         self.scene.anchor_stiffness_n_per_m * self.relative_anchor_stiffness_at(index) + by_foundation
     }
 
-    /// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables in their unit
-    /// ([`Plan::spring_unit`]) and the displacement in spacings.
-    pub(crate) fn spring_force_n(&self, spring_unit: f64, index: usize, gathered: f64, u: f64) -> f64 {
+    /// Returns the force of the springs on a point of a relative mass along an axis, N, from the gathered value of the tables in their
+    /// unit ([`Plan::spring_unit`]) and the displacement in spacings.
+    pub(crate) fn spring_force_n(&self, [spring_unit, mass]: [f64; 2], index: usize, gathered: f64, u: f64) -> f64 {
         let force_n = gathered / spring_unit;
         if !self.places.differ() {
             return force_n;
         }
         // Anchor stiffness beyond the reference K″ is not part of the springs.
         let pulled_n = self.scene.anchor_stiffness_n_per_m * self.extra_anchor_at(index) * u * self.unit_m;
-        self.relative_mass_at(index) * (force_n + pulled_n)
+        mass * (force_n + pulled_n)
     }
 
     /// Returns the number of places that a substep computes with all points awake: rows times columns in
     /// memory, a row counting as at least 16 columns, because a short row costs as much as one of a vector's
     /// width.
     pub fn swept_points(&self) -> usize {
-        self.points[0] * self.points[1].max(BLOCK)
+        self.rows_of_points() * self.points[1].max(BLOCK)
+    }
+
+    /// Returns the number of rows in memory that points are in; beyond them are the spare places of a solid.
+    pub(crate) fn rows_of_points(&self) -> usize {
+        self.places.solid().map_or(self.points[0], |solid| solid.corner_rows())
     }
 
     /// Returns false always: a tissue has at least one point.

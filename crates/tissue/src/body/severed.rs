@@ -1,7 +1,8 @@
 //! The springs of a tissue that have been severed. They are part of its state: the model never changes.
 //!
 //! A spring is known by its first end (the one with the lower place in memory) and by its number among the springs of that
-//! end ([`Model::springs_at`]). Each change of the set has a version, which only grows: also if the guard goes back to a
+//! end ([`Model::springs_at`]). In a solid, the face between two cubes stands for a spring between their middles, whose ends are
+//! at the cubes' least corners; what follows from severed faces is in `solid::corner_copies`. Each change of the set has a version, which only grows: also if the guard goes back to a
 //! checkpoint and so undoes a cut.
 
 use std::ops::Deref;
@@ -10,6 +11,7 @@ use std::sync::Arc;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::Model;
+use crate::body::solid::corner_copies::{CornerCopies, Doubled};
 use crate::saved::{SavedSpring, ensure, unsound};
 use crate::shape::PointId;
 use palpate_refusal::Result;
@@ -42,7 +44,7 @@ pub struct Cuts {
 /// A spring that is severed, by its points ([`Cuts::joints`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeveredJoint {
-    /// The points that it joined.
+    /// The points that it joined. In a solid: the least corners of two cubes with a severed face between them.
     pub points: [PointId; 2],
     /// Where it was severed: the part of the way from the first point to the second, 0 to 1.
     pub part: f64,
@@ -165,7 +167,8 @@ impl Cuts {
             let other = other.and_then(|other| u32::try_from(other).ok());
             let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
             let spring = SeveredSpring { ends: [place, other], number, part, version: since };
-            ensure(severed.add(model, spring), "a spring that is severed twice")?;
+            ensure(severed.has_room(model), "more severed springs than the tissue has room for")?;
+            ensure(severed.add(model, spring).is_some(), "a spring that is severed twice")?;
         }
         Ok(Cuts { version, grows_since: version, ..severed.cuts })
     }
@@ -177,6 +180,8 @@ pub(crate) struct Severed {
     cuts: Cuts,
     /// A bit for each spring at each of its ends; empty if nothing is severed.
     ends: Vec<u64>,
+    /// The doubled corners of a solid; `None` if nothing is severed.
+    copies: Option<Arc<CornerCopies>>,
 }
 
 impl Deref for Severed {
@@ -190,8 +195,8 @@ impl Deref for Severed {
 impl Severed {
     /// Returns the set of some severed springs.
     pub(crate) fn of(cuts: &Cuts, model: &Model) -> Self {
-        let mut severed = Severed { cuts: cuts.clone(), ends: Vec::new() };
-        cuts.springs.iter().for_each(|spring| severed.mark(model, spring, true));
+        let mut severed = Severed::default();
+        severed.replace(model, cuts);
         severed
     }
 
@@ -206,15 +211,40 @@ impl Severed {
         self.ends.get(end / 64).is_some_and(|bits| bits >> (end % 64) & 1 != 0)
     }
 
-    /// Adds a spring. Returns whether it was whole.
-    pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> bool {
+    /// Returns the doubled corners of a solid; `None` if nothing is severed, and for other tissues.
+    pub(crate) fn copies(&self) -> Option<&Arc<CornerCopies>> {
+        self.copies.as_ref()
+    }
+
+    /// Returns whether one more spring can be severed: a solid has spare places for so many doubled corners.
+    pub(crate) fn has_room(&self, model: &Model) -> bool {
+        match (&self.copies, model.places.solid()) {
+            (Some(copies), _) => copies.has_room(),
+            (None, Some(places)) => CornerCopies::none(places).has_room(),
+            (None, None) => true,
+        }
+    }
+
+    /// Adds a spring. Returns the corners that this doubles, if the spring was whole.
+    pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<Doubled>> {
         let [end, _] = spring.ends_of(model);
         if self.has(end) {
-            return false;
+            return None;
         }
         self.mark(model, &spring, true);
         Arc::make_mut(&mut self.cuts.springs).push(spring);
-        true
+        Some(self.double(model, &spring))
+    }
+
+    /// Doubles the corners that a severed face sets free.
+    fn double(&mut self, model: &Model, face: &SeveredSpring) -> Vec<Doubled> {
+        let Some(places) = model.places.solid() else { return Vec::new() };
+        let mut copies = self.copies.take().unwrap_or_else(|| Arc::new(CornerCopies::none(places)));
+        let is_severed = |cube: usize, axis: usize| self.has(model.first_end(cube) + 2 * axis);
+        let doubled =
+            Arc::make_mut(&mut copies).sever(places, face.ends[0] as usize, face.number as usize / 2, is_severed);
+        self.copies = Some(copies);
+        doubled
     }
 
     /// Begins a version of the topology.
@@ -229,7 +259,16 @@ impl Severed {
         let changed = [&self.cuts, cuts].map(|cuts| cuts.springs[shared..].to_vec());
         let [whole, severed] = &changed;
         whole.iter().for_each(|spring| self.mark(model, spring, false));
-        severed.iter().for_each(|spring| self.mark(model, spring, true));
+        // In a solid, what a face doubles depends on those before it.
+        let is_solid = model.places.solid().is_some();
+        if is_solid && !whole.is_empty() {
+            (self.ends, self.copies) = (Vec::new(), None);
+        }
+        let added = if is_solid && !whole.is_empty() { &cuts.springs[..] } else { severed };
+        for spring in added {
+            self.mark(model, spring, true);
+            self.double(model, spring);
+        }
         let is_same = whole.is_empty() && severed.is_empty();
         let version = (self.cuts.version + u32::from(!is_same)).max(cuts.version);
         let grows_since = if is_same { self.cuts.grows_since.max(cuts.grows_since) } else { version };

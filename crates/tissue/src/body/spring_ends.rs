@@ -9,6 +9,9 @@ use crate::kernel::springs::ENDS;
 /// The most springs that a point of a sheet has.
 pub(crate) const SHEET_ENDS: usize = 12;
 
+/// The faces of a cube: along each axis that with the higher coordinate, then the other.
+const SOLID_ENDS: usize = 6;
+
 /// A spring, seen from one of its ends.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SpringEnd {
@@ -24,7 +27,8 @@ pub(crate) struct SpringEnd {
 }
 
 impl Model {
-    /// Calls `each` with the springs of the point at a place in memory, by ascending number. A solid has none.
+    /// Calls `each` with the springs of the point at a place in memory, by ascending number. In a solid these are the faces of the cube
+    /// of which the place is the least corner, towards other cubes.
     #[inline]
     pub(crate) fn each_spring(&self, place: usize, mut each: impl FnMut(SpringEnd)) {
         let springs = &self.scene.springs;
@@ -56,11 +60,26 @@ impl Model {
                     each(SpringEnd { number, other, rest, stiffness_n_per_m, tension_n_per_m });
                 }
             }
-            Places::Solid(_) => {}
+            Places::Solid(places) => {
+                for number in 0..SOLID_ENDS {
+                    let (axis, is_higher) = (number / 2, number % 2 == 0);
+                    let Some(other) = places.cube_across(place, axis, is_higher) else { continue };
+                    let rest = if is_higher { DVec3::AXES[axis] } else { -DVec3::AXES[axis] };
+                    each(SpringEnd { number, other, rest, stiffness_n_per_m: 0.0, tension_n_per_m: 0.0 });
+                }
+            }
         }
     }
 
-    /// Returns the springs of the point at a place in memory, by ascending number. A solid has none.
+    /// Returns where the end of a spring at a place in memory is at rest, m: in a solid the middle of a cube.
+    pub(crate) fn end_at_rest_m(&self, place: usize) -> DVec3 {
+        match &self.places {
+            Places::Solid(places) => places.rest_m(place) + 0.5 * places.edge_m(),
+            Places::Sheet(_) | Places::Surface(_) => self.shape().rest_m(self.point_at(place)),
+        }
+    }
+
+    /// Returns the springs of the point at a place in memory, by ascending number.
     pub(crate) fn springs_at(&self, place: usize) -> Vec<SpringEnd> {
         let mut springs = Vec::new();
         self.each_spring(place, |spring| springs.push(spring));
@@ -72,7 +91,7 @@ impl Model {
         match &self.places {
             Places::Sheet(_) => SHEET_ENDS * place,
             Places::Surface(places) => places.slots.first_half(place),
-            Places::Solid(_) => 0,
+            Places::Solid(_) => SOLID_ENDS * place,
         }
     }
 
@@ -81,13 +100,17 @@ impl Model {
         match &self.places {
             Places::Sheet(_) => SHEET_ENDS * self.place_count(),
             Places::Surface(places) => places.slots.count(),
-            Places::Solid(_) => 0,
+            Places::Solid(places) => SOLID_ENDS * places.count(),
         }
     }
 
     /// Returns the number of a spring of a place among those of its other end. Panics if there is no such spring.
     pub(crate) fn number_at_other_end(&self, place: usize, number: usize) -> usize {
-        let Places::Surface(places) = &self.places else { return number / 4 * 4 + 3 - number % 4 };
+        let places = match &self.places {
+            Places::Sheet(_) => return number / 4 * 4 + 3 - number % 4,
+            Places::Solid(_) => return number ^ 1,
+            Places::Surface(places) => places,
+        };
         let others = || places.joined(place).map(|(other, ..)| other);
         let other = others().nth(number).unwrap_or_default();
         // Several springs may join the same points.

@@ -28,7 +28,7 @@ impl SpringSearch {
                     longest = longest.max(spring.rest.length());
                 });
                 if has_spring {
-                    let rest_m = model.shape().rest_m(model.point_at(place));
+                    let rest_m = model.end_at_rest_m(place);
                     (*least_m, *most_m) = (least_m.min(rest_m), most_m.max(rest_m));
                 }
             }

@@ -6,12 +6,14 @@ use std::sync::Arc;
 
 use crate::body::Places;
 use crate::body::advance::AdvanceStage;
+use crate::body::footprint::mass_at;
 use crate::body::force_field::{self, Pull, Term};
 use crate::body::model::{Model, Plan};
 use crate::body::severed::{Cuts, Severed, SeveredSpring};
 use crate::body::sheet::cuts::SheetCuts;
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
+use crate::body::solid::corner_copies::Doubled;
 use crate::body::solid::{self, NeoHookean, PointLoad, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
 use crate::body::spring_ends::SHEET_ENDS;
 use crate::body::surface::pressure::{Pressure, push_of};
@@ -68,7 +70,8 @@ impl<T: Real> Elastic<T> {
                 springs.gather(layout, u, point, |number| severed.has(first + number))
             }
             Elastic::Solid(places, law, load) => {
-                solid::gather(places, law, load, layout, u, point[0] * layout.columns + point[1])
+                let copies = severed.copies().map(|copies| &**copies);
+                solid::gather(places, copies, law, load, layout, u, point[0] * layout.columns + point[1])
             }
             Elastic::Mesh(places, unit, pull, factor) => {
                 let slot = point[0] * BLOCK + point[1];
@@ -207,13 +210,27 @@ impl<T: Real> SweepTables<T> {
         self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
     }
 
-    /// Severs a spring. Returns whether it was whole.
-    pub(crate) fn sever(&mut self, model: &Model, spring: SeveredSpring) -> bool {
-        let is_new = self.severed.add(model, spring);
-        if is_new {
-            self.set_spring(model, &spring, true);
+    /// Severs a spring. Returns the corners that this doubles, if the spring was whole.
+    pub(crate) fn sever(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<Doubled>> {
+        let doubled = self.severed.add(model, spring)?;
+        self.set_spring(model, &spring, true);
+        if let (Some(solid), Some(places), Some(copies)) =
+            (&mut self.solid, model.places.solid(), self.severed.copies())
+        {
+            for copy in &doubled {
+                solid.double(places, &self.layout, copies, copy);
+            }
         }
-        is_new
+        doubled.iter().for_each(|copy| self.hold_copy(copy.to));
+        Some(doubled)
+    }
+
+    /// Makes a copy of a corner fixed if the corner is.
+    fn hold_copy(&mut self, place: usize) {
+        let Some(copies) = self.severed.copies() else { return };
+        if let Some(free) = &mut self.free {
+            free[self.layout.offset(place)] = free[self.layout.offset(copies.corner_of(place))];
+        }
     }
 
     /// Makes the severed springs those of `cuts` ([`Severed::replace`]).
@@ -221,6 +238,16 @@ impl<T: Real> SweepTables<T> {
         let [whole, severed] = self.severed.replace(model, cuts);
         whole.iter().for_each(|spring| self.set_spring(model, spring, false));
         severed.iter().for_each(|spring| self.set_spring(model, spring, true));
+        let copies = self.severed.copies().cloned();
+        if let (Some(solid), Some(places)) = (&mut self.solid, model.places.solid()) {
+            solid.follow(places, &self.layout, copies.as_deref());
+        }
+        copies.iter().flat_map(|copies| copies.places()).for_each(|place| self.hold_copy(place));
+    }
+
+    /// Returns the relative mass at a place in memory, after cuts.
+    pub(crate) fn relative_mass_at(&self, model: &Model, place: usize) -> f64 {
+        mass_at(model, self.severed.copies().map(|copies| &**copies), place)
     }
 
     /// Writes to the tables whether a spring is severed, as the set of severed springs has it.

@@ -94,9 +94,6 @@ fn check_edge(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     if tip.coupling != Coupling::Constraint {
         return refuse("spring", "is for a tip that touches: a blade cuts");
     }
-    if !shape.takes_blades() {
-        return refuse("shape", "is a blade, but a solid can't be cut: use a sheet or a surface");
-    }
     Ok(())
 }
 
@@ -110,7 +107,7 @@ const MIN_RIGID_RADIUS: f64 = 0.25;
 /// longest side, and on a mesh at most 32 mean edge lengths; friction is from 0 to 10; a coupling spring has a
 /// stiffness from 1e-12 to 1e12 N/m and a damping from 0 to 1e12 N·s/m. `field` is the tip's key: the refusal
 /// gives `{field}.radius_m` and the like. A rigid shape is for solids, from a quarter of
-/// a cell on, without a grasp and without a spring. A blade has an edge and neither of these; a solid can't be cut.
+/// a cell on, without a grasp and without a spring. A blade has an edge and neither of these.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let (most_m, what) = shape.most_tip_radius_m();
     let range = format!("above 0 and at most {}, {what}", legible(most_m));

@@ -100,6 +100,7 @@ impl<T: Real> TissueState<T> {
         sheet.contacts.clone_from(&checkpoint.contacts);
         sheet.tiles.largest = checkpoint.largest;
         sheet.tables.set_severed(model, &checkpoint.cuts);
+        sheet.contacts.follow_cuts(model, sheet.tables.severed.copies());
         sheet
     }
 

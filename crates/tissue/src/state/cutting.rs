@@ -10,6 +10,8 @@
 //! **The same everywhere.** The tests are exact comparisons of signed volumes in f64, from a state that has the same bits on every
 //! machine. A volume of exactly 0 counts as positive. Springs are severed in ascending order.
 //!
+//! **Solids.** A face between two cubes is severed like a spring between their middles (`faces`).
+//!
 //! **What follows.** With a pretension, a severed spring leaves the load that held the rest shape against it
 //! (`kernel::springs`): the wound gapes. A multistep scheme keeps the past forces of the springs at each point: the present force of a severed
 //! spring is taken out of all of them, as if it had always been severed. Its energy leaves the tissue: it opens the cut. Severing only
@@ -106,14 +108,22 @@ impl<T: Real> TissueState<T> {
             return;
         }
         self.prepare_to_cut();
-        let mut crossings: Vec<Crossing> = sweeps.iter().flat_map(|sweep| self.crossed(sweep)).collect();
+        let crossed =
+            |sweep| if self.model.places.solid().is_some() { self.crossed_faces(sweep) } else { self.crossed(sweep) };
+        let mut crossings: Vec<Crossing> = sweeps.iter().flat_map(crossed).collect();
         crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
         crossings.dedup_by_key(|crossing| (crossing.place, crossing.spring.number));
+        if crossings.is_empty() {
+            return self.ended(StepStage::Contact);
+        }
         let version = self.tables.severed.version() + 1;
         let mut any = false;
+        // Discs share the copies of corners, which change.
+        self.contacts.follow_cuts(&self.model, None);
         for crossing in crossings {
             any |= self.sever(&crossing, version);
         }
+        self.contacts.follow_cuts(&self.model, self.tables.severed.copies());
         if any {
             self.tables.severed.begin_version(version);
             // A twin that steps otherwise severs other springs: that is no error of the stepping.
@@ -211,10 +221,13 @@ impl<T: Real> TissueState<T> {
         let ends = [place, spring.other];
         let severed =
             SeveredSpring { ends: ends.map(|place| place as u32), number: spring.number as u32, part, version };
-        if !self.tables.sever(&self.model, severed) {
+        let (model, layout) = (self.model.clone(), self.tables.layout);
+        if model.places.solid().is_some() {
+            return self.sever_face(severed);
+        }
+        if self.tables.sever(&model, severed).is_none() {
             return false;
         }
-        let (model, layout) = (self.model.clone(), self.tables.layout);
         for place in ends {
             self.tiles.wake_around(model.point_of(place), self.plan.scheme.sweeps());
         }
@@ -247,5 +260,6 @@ impl<T: Real> TissueState<T> {
     }
 }
 
+mod faces;
 #[cfg(test)]
 mod tests;

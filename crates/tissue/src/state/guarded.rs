@@ -220,6 +220,7 @@ impl<T: Real> TissueState<T> {
         self.contacts.clone_from(&checkpoint.contacts);
         self.work = checkpoint.work;
         self.tables.set_severed(&self.model, &checkpoint.cuts);
+        self.contacts.follow_cuts(&self.model, self.tables.severed.copies());
         let was = checkpoint.halvings;
         self.halve(was, halvings);
         self.tables.is_settled(0.0);
@@ -366,7 +367,7 @@ impl<T: Real> TissueState<T> {
         is_free
             && tiles.region.tiles().is_empty()
             && !model.places.is_pulled()
-            && is_inverted(places, &tables.layout, &state.u)
+            && is_inverted(places, tables.severed.copies().map(|copies| &**copies), &tables.layout, &state.u)
     }
 
     /// Brings a tissue that nothing holds to its shape at rest.

@@ -52,7 +52,7 @@ impl<T: Real> PointReader<'_, T> {
         if let Some(motion) = motion {
             (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
         }
-        let mass = model.relative_mass_at(index);
+        let mass = self.tables.relative_mass_at(model, index);
         let anchor_n = -scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index) * displacement_m;
         let damping_n = -scene.damping_n_s_per_m * mass * velocity_m_per_s;
         let constraint_n = motion.map(|motion| {
@@ -111,7 +111,7 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
             model.point_of(index),
         );
         let [i, j] = model.point_of(index);
-        let mass = model.relative_mass_at(index);
+        let mass = tables.relative_mass_at(model, index);
         let still = reader.steps == 0 || !reader.tiles.region.is_awake(i, j);
         // Without all present forces, a two-step scheme would report a velocity for a point that rests under a
         // tip.
@@ -139,7 +139,7 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
                     added += plan.added_weights[k] * kept[k - 1].0;
                 }
             }
-            found[2][c] = model.spring_force_n(reader.spring_unit, index, n.0 + added, state.u[at].wide());
+            found[2][c] = model.spring_force_n([reader.spring_unit, mass], index, n.0 + added, state.u[at].wide());
         }
         found
     }

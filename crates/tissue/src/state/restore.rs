@@ -8,7 +8,7 @@ use std::sync::Arc;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::{Model, Plan};
-use crate::body::severed::Cuts;
+use crate::body::severed::{Cuts, Severed};
 use crate::body::tables::springs_of;
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
@@ -90,7 +90,7 @@ impl Model {
         let mut add = |bytes: &[u8]| hasher.update(bytes);
         add(b"palpate tissue 1");
         let scene = &self.scene;
-        for number in [self.points[0], self.points[1], self.len(), self.fixed.len()] {
+        for number in [self.rows_of_points(), self.points[1], self.len(), self.fixed.len()] {
             add(&(number as u64).to_le_bytes());
         }
         self.fixed.iter().for_each(|index| add(&(*index as u64).to_le_bytes()));
@@ -235,6 +235,7 @@ fn restored_as<T: Real>(
     sheet.tiles.restore(&parts.tiles)?;
     let cuts = Cuts::restored(&parts.severed, parts.topology_version, model)?;
     sheet.tables.set_severed(model, &cuts);
+    sheet.contacts.follow_cuts(model, sheet.tables.severed.copies());
 
     let size = size_of::<T>();
     ensure(values.len().is_multiple_of(size), "part of a value")?;
@@ -302,16 +303,19 @@ fn checkpoint_of<T: Real>(
     let severed = usize::try_from(saved.severed).unwrap_or(usize::MAX);
     ensure(severed <= tissue.tables.severed.len(), "more severed springs in its checkpoint than now")?;
     let scale = halved(model, saved.halvings).force_scale(&model.scene);
+    let cuts = tissue.tables.severed.first(severed);
+    let mut contacts = Contacts::restored(&saved.contacts, model, checks)?;
+    contacts.follow_cuts(model, Severed::of(&cuts, model).copies());
     Ok(Checkpoint {
         steps: saved.steps,
         halvings: saved.halvings,
         state,
         applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
         prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
-        contacts: Contacts::restored(&saved.contacts, model, checks)?,
+        contacts,
         work: WorkAccount::restored(&saved.work)?,
         largest: saved.largest,
         passed_checks: saved.passed_checks,
-        cuts: tissue.tables.severed.first(severed),
+        cuts,
     })
 }

@@ -57,6 +57,10 @@ impl<T: Real> TissueState<T> {
 
     /// Wakes tiles beside moving points, and around grasped points that will move.
     fn wake(&mut self, Substep { from, end, far }: Substep) {
+        // Copies of corners are far in memory from the cubes that they join: a solid with cuts is awake as a whole.
+        if self.tables.severed.copies().is_some() && !self.tiles.region.tiles().is_empty() {
+            self.tiles.wake_all();
+        }
         self.tiles.wake_beside_moved([&self.state.u, &self.state.d], self.plan.scheme.sweeps(), far);
         let (mut context, prescribed, _) = self.parts();
         wake_moved(&mut context, prescribed, from.step, end, far);

@@ -396,10 +396,11 @@ impl<T: Real> Tissue for TissueState<T> {
         }
     }
 
-    /// Counts the blocks of all rows.
+    /// Counts the blocks of all rows in use.
     fn hash_block_count(&self) -> usize {
-        let Layout { rows, columns, .. } = self.tables.layout;
-        rows * columns.div_ceil(BLOCK)
+        let Layout { columns, .. } = self.tables.layout;
+        let rows = self.tables.severed.copies().map_or(0, |copies| copies.end().div_ceil(columns));
+        rows.max(self.model.rows_of_points()) * columns.div_ceil(BLOCK)
     }
 
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {

@@ -54,6 +54,7 @@ use glam::DVec3;
 use crate::body::footprint::{Footprint, RestSurface, WeightedNode};
 use crate::body::model::{Model, Plan, displacement_m};
 use crate::body::severed::Cuts;
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::body::window::Window;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
@@ -175,6 +176,8 @@ fn rigid_tip(tip: Tip) -> Option<RigidTip> {
 pub(crate) struct Contacts {
     /// By ascending number.
     pub(crate) tools: Vec<Tool>,
+    /// The corners of a solid that cuts have doubled.
+    copies: Option<Arc<CornerCopies>>,
 }
 
 impl Contacts {
@@ -185,6 +188,7 @@ impl Contacts {
             if is_other {
                 tool.rigid = rigid_tip(tip);
                 tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.anchor_m());
+                tool.footprint.follow_cuts(model, self.copies.as_ref());
             }
             if is_other || tool.tip.grasps != tip.grasps {
                 (tool.contact_state, tool.steady_n, tool.is_new) = (ContactState::Free, DVec3::ZERO, true);
@@ -196,10 +200,12 @@ impl Contacts {
             return;
         }
         let index = self.tools.partition_point(|tool| tool.number < number);
+        let mut footprint = Footprint::new(model, tip.radius_m, to_m);
+        footprint.follow_cuts(model, self.copies.as_ref());
         let tool = Tool {
             number,
             tip,
-            footprint: Footprint::new(model, tip.radius_m, to_m),
+            footprint,
             from_m: to_m,
             to_m,
             from_edge_m: tip.edge_m,
@@ -224,7 +230,18 @@ impl Contacts {
     pub(crate) fn restored(saved: &[SavedContact], model: &Model, checks: &Checks<'_>) -> Result<Self> {
         let tools: Vec<Tool> = saved.iter().map(|tool| Tool::restored(tool, model, checks)).collect::<Result<_>>()?;
         ensure(tools.is_sorted_by(|a, b| a.number < b.number), "tools out of order")?;
-        Ok(Contacts { tools })
+        Ok(Contacts { tools, copies: None })
+    }
+
+    /// Lets all tools move with these copies of a solid's corners; `None` gives up those that they have.
+    pub(crate) fn follow_cuts(&mut self, model: &Model, copies: Option<&Arc<CornerCopies>>) {
+        self.copies = copies.cloned();
+        for tool in &mut self.tools {
+            tool.footprint.follow_cuts(model, copies);
+            if let (Some(rigid), true) = (&mut tool.rigid, copies.is_some()) {
+                rigid.follow_cuts(model, &tool.footprint);
+            }
+        }
     }
 
     pub(crate) fn is_empty(&self) -> bool {

@@ -259,6 +259,15 @@ impl RigidTip {
         Ok(restored)
     }
 
+    /// Lets the tip move with the copies of corners that its disc has got, on the same part of the surface.
+    pub(crate) fn follow_cuts(&mut self, model: &Model, footprint: &Footprint) {
+        let Some(around) = self.around else { return };
+        if let Ok(taken_from) = footprint.at_saved(model, &around.saved) {
+            self.take_samples(model, &taken_from);
+            self.cover(model, footprint);
+        }
+    }
+
     /// Returns whether the tip pressed in the last substep.
     pub(crate) fn is_pressing(&self) -> bool {
         self.forces_n.iter().any(|force_n| *force_n != DVec3::ZERO)
@@ -334,19 +343,23 @@ impl RigidTip {
         let Tip { radius_m, .. } = self.tip;
         let taken = footprint.samples(AROUND * radius_m, spacing_m(radius_m, model.unit_m));
         let place_of = |point: &u32| model.place_of(PointId::new(*point as usize));
-        let mut places: Vec<usize> = taken.iter().flat_map(|sample| sample.cell.points.iter().map(place_of)).collect();
+        let corners = |sample: &SurfaceSample| match sample.copies {
+            Some(places) => places.map(|place| place as usize),
+            None => sample.cell.points.map(|point| place_of(&point)),
+        };
+        let mut places: Vec<usize> = taken.iter().flat_map(corners).collect();
         places.sort_unstable();
         places.dedup();
         let node = |place: usize| {
-            let is_fixed = model.fixed.binary_search(&place).is_ok();
-            let inverse_mass = if is_fixed { 0.0 } else { model.relative_mass_at(place).recip() };
+            let is_fixed = model.fixed.binary_search(&footprint.corner_of(place)).is_ok();
+            let inverse_mass = if is_fixed { 0.0 } else { footprint.mass_at(model, place).recip() };
             TouchedPoint { point: model.point_of(place), place, inverse_mass }
         };
         let nodes: Arc<[TouchedPoint]> = places.iter().map(|place| node(*place)).collect();
         let sample = |sample: &SurfaceSample| {
-            let number = |point: u32| places.partition_point(|place| *place < place_of(&point)) as u32;
+            let number = |corner: usize| places.partition_point(|place| *place < corner) as u32;
             let mut numbers = [0; 8];
-            numbers.iter_mut().zip(sample.cell.points).for_each(|(of, point)| *of = number(point));
+            numbers.iter_mut().zip(corners(sample)).for_each(|(of, corner)| *of = number(corner));
             let weights = sample.cell.weights;
             let parts =
                 numbers.iter().zip(&weights).map(|(node, weight)| weight * weight * nodes[*node as usize].inverse_mass);

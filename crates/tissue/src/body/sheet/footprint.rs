@@ -18,10 +18,9 @@ use std::sync::OnceLock;
 
 use glam::{DVec2, DVec3};
 
-use crate::body::disc::TissueDisc;
+use crate::body::disc::{DiscPoint, TissueDisc};
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::Sheet;
-use crate::shape::PointId;
 use palpate_refusal::Result;
 
 /// Smallest number of rings in a disc; larger discs have two per spacing.
@@ -183,8 +182,8 @@ impl TissueDisc for GridDisc {
         true
     }
 
-    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2)) {
-        self.covered().for_each(|(point, weight, gradient)| add(self.sheet.point(point), weight, gradient));
+    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
+        self.covered().for_each(|(point, weight, gradient)| add(self.sheet.point(point).into(), weight, gradient));
     }
 }
 

@@ -8,7 +8,8 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::body::disc::{SurfaceSample, TissueDisc};
+use crate::body::disc::{DiscPoint, SurfaceSample, TissueDisc};
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::body::surface::footprint::MeshDisc;
 use crate::saved::SavedPlace;
 use crate::scene::SolidShape;
@@ -18,10 +19,19 @@ use palpate_refusal::Result;
 /// A side of a triangle is divided into at most so many parts.
 const MAX_SIDE_PARTS: f64 = 16.0;
 
+/// Returns the places of the corners of a cell, if a cut has doubled any of them.
+fn copies_in(shape: &SolidShape, copies: Option<&CornerCopies>, cell: &CellPlace) -> Option<[u32; 8]> {
+    let copies = copies?;
+    let number = copies.number_of(shape.corner_of(PointId::new(cell.points[0] as usize)))?;
+    Some(copies.cubes()[number].corners)
+}
+
 /// The part of a vertex's weight and derivative that a point gets.
 #[derive(Debug, Clone, Copy)]
 struct CoveredPart {
     point: u32,
+    /// The place of the point, or of the copy of it, in memory.
+    place: u32,
     /// In which order the parts were found, and are added.
     order: u32,
     weight: f64,
@@ -35,13 +45,20 @@ pub(crate) struct SolidDisc {
     disc: MeshDisc,
     /// What each vertex gives to its points; kept, so that a step allocates nothing.
     covered: Vec<CoveredPart>,
+    /// The corners that cuts have doubled.
+    copies: Option<Arc<CornerCopies>>,
 }
 
 impl SolidDisc {
     /// Creates a disc at an arbitrary place.
     pub(crate) fn new(shape: &Arc<SolidShape>, radius_m: f64) -> Self {
         let disc = MeshDisc::whole(shape.surface(), radius_m);
-        SolidDisc { shape: shape.clone(), disc, covered: Vec::new() }
+        SolidDisc { shape: shape.clone(), disc, covered: Vec::new(), copies: None }
+    }
+
+    /// Returns the places of the corners of a cell, if a cut has doubled any of them.
+    fn copies_in(&self, cell: &CellPlace) -> Option<[u32; 8]> {
+        copies_in(&self.shape, self.copies.as_deref(), cell)
     }
 }
 
@@ -114,7 +131,8 @@ impl TissueDisc for SolidDisc {
             let mut add = |by_along: f64, by_across: f64| {
                 let rest_m = a + by_along * along + by_across * across;
                 let outward = cross.normalize_or_zero();
-                samples.push(SurfaceSample { rest_m, outward, area_m2, cell: self.shape.bind(rest_m) });
+                let cell = self.shape.bind(rest_m);
+                samples.push(SurfaceSample { rest_m, outward, area_m2, copies: self.copies_in(&cell), cell });
             };
             let parts = parts as u32;
             for i in 0..parts {
@@ -130,24 +148,41 @@ impl TissueDisc for SolidDisc {
         samples
     }
 
-    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2)) {
-        let SolidDisc { shape, disc, covered } = self;
+    fn follow_copies(&mut self, copies: Option<&Arc<CornerCopies>>) {
+        self.copies = copies.cloned();
+    }
+
+    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
+        let SolidDisc { shape, disc, covered, copies } = self;
         covered.clear();
         disc.cover(&mut |vertex, weight, gradient| {
-            let CellPlace { points, weights } = shape.cell_of(vertex.index());
-            for (point, part) in points.iter().zip(weights).filter(|(_, part)| **part > 0.0) {
-                let order = u32::try_from(covered.len()).unwrap_or(u32::MAX);
-                covered.push(CoveredPart { point: *point, order, weight: part * weight, gradient: *part * gradient });
+            let cell = shape.cell_of(vertex.point.index());
+            let of_cell = copies_in(shape, copies.as_deref(), cell);
+            for (corner, (point, part)) in cell.points.iter().zip(&cell.weights).enumerate() {
+                if *part > 0.0 {
+                    let order = u32::try_from(covered.len()).unwrap_or(u32::MAX);
+                    let place = of_cell.map_or_else(|| corner_of(shape, *point), |places| places[corner]);
+                    let (weight, gradient) = (part * weight, *part * gradient);
+                    covered.push(CoveredPart { point: *point, place, order, weight, gradient });
+                }
             }
         });
-        covered.sort_unstable_by_key(|part| (part.point, part.order));
-        for of_point in covered.chunk_by(|a, b| a.point == b.point) {
+        // In the order of memory.
+        covered.sort_unstable_by_key(|part| (part.place, part.order));
+        for of_place in covered.chunk_by(|a, b| a.place == b.place) {
             let (mut weight, mut gradient) = (0.0, DVec2::ZERO);
-            for part in of_point {
+            for part in of_place {
                 weight += part.weight;
                 gradient += part.gradient;
             }
-            add(PointId::new(of_point[0].point as usize), weight, gradient);
+            let CoveredPart { point, place, .. } = of_place[0];
+            let copy = (place != corner_of(shape, point)).then_some(place as usize);
+            add(DiscPoint { point: PointId::new(point as usize), copy }, weight, gradient);
         }
     }
+}
+
+/// Returns the corner of a point.
+fn corner_of(shape: &SolidShape, point: u32) -> u32 {
+    u32::try_from(shape.corner_of(PointId::new(point as usize))).unwrap_or(u32::MAX)
 }

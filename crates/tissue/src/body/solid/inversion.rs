@@ -6,18 +6,25 @@
 
 use glam::DVec3;
 
+use super::corner_copies::CornerCopies;
 use super::places::SolidPlaces;
 use crate::kernel::field::Layout;
 use crate::kernel::real::Real;
 
 /// Returns whether a cube has J < 0 at a corner. There J is the determinant of the cube's three edges, divided by that at rest.
-pub(crate) fn is_inverted<T: Real>(places: &SolidPlaces, layout: &Layout, u: &[T]) -> bool {
+pub(crate) fn is_inverted<T: Real>(
+    places: &SolidPlaces,
+    copies: Option<&CornerCopies>,
+    layout: &Layout,
+    u: &[T],
+) -> bool {
     let displacement = |place: usize| {
         let at = layout.offset(place);
         DVec3::from_array(std::array::from_fn(|c| u[c * layout.plane + at].wide()))
     };
     let has_inverted_corner = |cube: usize| {
-        let corners = places.corners_of(cube).map(displacement);
+        let corners = copies.map_or_else(|| places.corners_of(cube), |copies| copies.corners_of(places, cube));
+        let corners = corners.map(displacement);
         let edge = |corner: usize, axis: usize| {
             let (near, far) = (corner & !(1 << axis), corner | 1 << axis);
             DVec3::AXES[axis] + corners[far] - corners[near]

@@ -59,13 +59,11 @@ fn patterns_of(corners: &[DVec3; 8]) -> Patterns<One> {
 /// Returns the force on each corner, outward: what resists the displacement that causes it.
 #[inline(always)]
 pub(super) fn resisting(stress: &Stress<One>) -> [DVec3; 8] {
+    let inward = stress.on_corners();
     let mut forces = [DVec3::ZERO; 8];
-    for c in 0..3 {
-        let sides = [stress.on_near_side(c, [Scalar(0.0); 4]), stress.on_far_side(c)];
-        for corner in 0..8 {
-            let signed = |bit: usize, value: f64| if corner >> bit & 1 == 1 { value } else { -value };
-            let [Scalar(all), Scalar(z), Scalar(x), Scalar(xz)] = sides[corner >> 1 & 1];
-            forces[corner][c] = all + signed(2, z) + signed(0, x + signed(2, xz));
+    for corner in 0..8 {
+        for c in 0..3 {
+            forces[corner][c] = -inward[corner][c].0;
         }
     }
     forces

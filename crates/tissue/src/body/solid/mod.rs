@@ -7,6 +7,8 @@
 //! as F says ([`neo_hookean`]), and resists the other ways in which eight corners can move (hourglasses) as the integral of
 //! μ|F|²/2 over the cube does. So one evaluation a cube suffices, and nothing locks.
 
+pub(crate) mod corner_copies;
+pub(crate) mod cut_cubes;
 pub(crate) mod footprint;
 pub(crate) mod inversion;
 pub(crate) mod linear_cells;

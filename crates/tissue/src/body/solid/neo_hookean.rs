@@ -205,6 +205,22 @@ impl<V: Vector> Stress<V> {
         let ([px, py, pz], [g1, g2, g3, g4], [three, one]) = (self.p[c], self.g[c], self.hours);
         [py, three.mul_add(g1, pz), three.mul_add(g3, px), one.mul_add(g4, three.mul(g2))]
     }
+
+    /// Returns the force on each corner, x before y before z, by component.
+    #[inline(always)]
+    pub(super) fn on_corners(&self) -> [[V; 3]; 8] {
+        let zero = self.hours[0].splat(V::Real::default());
+        let mut forces = [[zero; 3]; 8];
+        for c in 0..3 {
+            let sides = [self.on_near_side(c, [zero; 4]), self.on_far_side(c)];
+            for corner in 0..8 {
+                let [all, z, x, xz] = sides[corner >> 1 & 1];
+                let (both, along) = if corner >> 2 == 1 { (all.add(z), x.add(xz)) } else { (all.sub(z), x.sub(xz)) };
+                forces[corner][c] = if corner & 1 == 1 { zero.sub(both.add(along)) } else { along.sub(both) };
+            }
+        }
+        forces
+    }
 }
 
 impl<T: Real> NeoHookean<T> {

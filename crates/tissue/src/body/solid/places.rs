@@ -8,6 +8,7 @@ use glam::DVec3;
 use crate::body::tile_links::TileLinks;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::real::Real;
+use crate::kernel::region::TILE;
 use crate::memory;
 use crate::scene::profile::Poke;
 use crate::scene::{BodyKind, Solid, SolidShape};
@@ -16,12 +17,18 @@ use crate::shape::{PointId, RestShape};
 /// Name of the tables in messages.
 const TABLES: &str = "the cubes of a solid";
 
-/// The places of a solid. A place is a corner of the lattice: x runs fastest, then y.
+/// One spare place for each of so many corners: a cut through the middle of a block of 27³ cubes doubles a twenty-eighth of them.
+const CORNERS_PER_SPARE: usize = 8;
+
+/// The places of a solid. A place is a corner of the lattice: x runs fastest, then y. Beyond them are spare places, which cuts
+/// use (`corner_copies`).
 #[derive(Debug)]
 pub(crate) struct SolidPlaces {
     shape: Arc<SolidShape>,
     /// Corners along each axis.
     corners: [usize; 3],
+    /// Rows of spare places.
+    spare_rows: usize,
     /// The weight of the cube of which each place is the least corner: its part times its factor of E.
     weights: Vec<f64>,
     /// The relative mass of each place; 0 where there is no point.
@@ -66,6 +73,7 @@ impl SolidPlaces {
         let mut places = SolidPlaces {
             shape,
             corners,
+            spare_rows: count.div_ceil(CORNERS_PER_SPARE).div_ceil(corners[0]),
             weights,
             masses,
             largest_mass,
@@ -75,13 +83,29 @@ impl SolidPlaces {
             links: TileLinks::default(),
             lame_over_youngs: [solid.material.shear_over_youngs(), solid.material.lame_over_youngs()],
         };
-        places.links = TileLinks::of([corners[1] * corners[2], corners[0]], |place| places.beside(place));
+        places.links = TileLinks::of(places.size(), |place| places.beside(place));
         places
     }
 
-    /// Returns the number of rows and of columns in memory.
+    /// Returns the number of rows and of columns in memory, with spare places.
     pub(crate) fn size(&self) -> [usize; 2] {
-        [self.corners[1] * self.corners[2], self.corners[0]]
+        [self.first_spare_row() + self.spare_rows, self.corners[0]]
+    }
+
+    /// Returns the first row of spare places: that of the next tile, so that no tile has both corners and copies.
+    fn first_spare_row(&self) -> usize {
+        self.corner_rows().next_multiple_of(TILE)
+    }
+
+    /// Returns the number of rows of corners; those of spare places follow.
+    pub(crate) fn corner_rows(&self) -> usize {
+        self.corners[1] * self.corners[2]
+    }
+
+    /// Returns the spare places.
+    pub(crate) fn spare(&self) -> Range<usize> {
+        let first = self.first_spare_row() * self.corners[0];
+        first..first + self.spare_rows * self.corners[0]
     }
 
     /// Returns Lamé's μ and λ divided by E.
@@ -89,9 +113,14 @@ impl SolidPlaces {
         self.lame_over_youngs
     }
 
-    /// Returns the number of places.
+    /// Returns the number of corners.
     pub(crate) fn count(&self) -> usize {
         self.masses.len()
+    }
+
+    /// Returns the part of a cube that counts for mass; 0 where there is none.
+    pub(crate) fn cube_mass(&self, cube: usize) -> f64 {
+        if self.weights[cube] > 0.0 { self.shape.mass_part_at(cube) } else { 0.0 }
     }
 
     /// Returns the number of rows of a plane across z.
@@ -105,8 +134,9 @@ impl SolidPlaces {
         (0..self.count()).filter(is_fixed).collect()
     }
 
+    /// Returns the relative mass of a corner before any cut; 0 at a spare place.
     pub(crate) fn mass(&self, place: usize) -> f64 {
-        self.masses[place]
+        self.masses.get(place).copied().unwrap_or(0.0)
     }
 
     /// Returns the stiffness of the foundation at a place divided by its relative mass, in that of a face of a cube.
@@ -114,8 +144,9 @@ impl SolidPlaces {
         self.beds.get(place).copied().unwrap_or(0.0)
     }
 
+    /// Returns the weight of the cube of which a place is the least corner; 0 where there is none.
     pub(crate) fn weight(&self, place: usize) -> f64 {
-        self.weights[place]
+        self.weights.get(place).copied().unwrap_or(0.0)
     }
 
     pub(crate) fn place_of(&self, point: PointId) -> usize {
@@ -124,7 +155,11 @@ impl SolidPlaces {
 
     /// Returns the point at a place; the first point where there is none.
     pub(crate) fn point_at(&self, place: usize) -> PointId {
-        self.shape.point_at_corner(place).unwrap_or(PointId::new(0))
+        if place < self.count() {
+            self.shape.point_at_corner(place).unwrap_or(PointId::new(0))
+        } else {
+            PointId::new(0)
+        }
     }
 
     /// Returns the point at each place (the number of none where there is none), and the place of each point.
@@ -132,7 +167,12 @@ impl SolidPlaces {
         self.shape.order()
     }
 
-    /// Returns the rest position of a place, m.
+    /// Returns the edge of a cube, m.
+    pub(crate) fn edge_m(&self) -> f64 {
+        self.shape.lattice().edge_m
+    }
+
+    /// Returns the rest position of a corner, m.
     pub(crate) fn rest_m(&self, place: usize) -> DVec3 {
         self.shape.corner_m(place)
     }
@@ -153,6 +193,9 @@ impl SolidPlaces {
         let [i, j, k] = self.shape.corner_at(place);
         let [x, y, _] = self.corners;
         let mut cubes = [None; 4];
+        if place >= self.count() {
+            return cubes;
+        }
         for (row, cube) in cubes.iter_mut().enumerate() {
             let (by_y, by_z) = (row & 1, row >> 1);
             if i >= beside && j >= by_y && k >= by_z {
@@ -161,6 +204,16 @@ impl SolidPlaces {
             }
         }
         cubes
+    }
+
+    /// Returns the cube on the other side of a face of a cube: across the face with the higher coordinate along an axis, or the lower.
+    pub(crate) fn cube_across(&self, cube: usize, axis: usize, is_higher: bool) -> Option<usize> {
+        let [x, y, _] = self.corners;
+        let by = [1, x, x * y][axis];
+        let at = self.shape.corner_at(cube)[axis];
+        let other = if is_higher { cube + by } else { (at > 0).then(|| cube - by)? };
+        // Beyond the last cube of a row there is a corner without one.
+        (self.weight(cube) > 0.0 && self.weight(other) > 0.0).then_some(other)
     }
 
     /// Returns the places that share a cube with a place, with itself; some twice.
@@ -191,6 +244,8 @@ impl SolidPlaces {
     pub(crate) fn box_of(&self, [rows, columns]: &[Range<usize>; 2]) -> [[f64; 2]; 3] {
         let lattice = self.shape.lattice();
         let y = self.corners[1];
+        // Spare places are nowhere: the last row stands for them.
+        let rows = rows.start.min(self.corner_rows() - 1)..rows.end.min(self.corner_rows());
         let [first, last] = [rows.start / y, (rows.end - 1) / y];
         // Rows of several planes may be anywhere along y.
         let along_y = if first == last { [rows.start % y, (rows.end - 1) % y] } else { [0, y - 1] };
@@ -216,9 +271,13 @@ impl SolidPlaces {
             let (mut first, mut end) = (usize::MAX, 0);
             for column in columns.clone() {
                 let place = row * layout.columns + column;
-                let mass = self.masses[place];
+                let mass = self.mass(place);
+                if mass == 0.0 {
+                    factors[column] = T::default();
+                    continue;
+                }
                 let exponent = -poke.falloff_per_m * self.rest_m(place).distance(poke.centre_m);
-                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && mass > 0.0;
+                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT;
                 factors[column] = if reaches { T::of(libm::exp(exponent) / mass) } else { T::default() };
                 if factors[column] != T::default() {
                     (first, end) = (first.min(column), column + 1);

@@ -11,6 +11,9 @@
 //! A row is three loops: over what each cube pulls with, over the sums of forces, and over the corners that advance. Each is short
 //! enough for a processor to work on several blocks at once; one loop was not, and took half as long again.
 //!
+//! Cubes beside cuts have the weight 0 in their rows. What they pull with is known before the first row ([`CutCubes`]), because the sweep
+//! overwrites the displacements of corners that it has done. Copies of corners are in rows of their own, after those of the lattice.
+//!
 //! A lane's result depends on the same operations in the same order at every width. Blocks of eight columns without a
 //! cube are skipped; a cube of weight 0 has a force of 0, so this changes no bit either.
 #![allow(unsafe_code)]
@@ -23,12 +26,14 @@ use std::ops::Range;
 
 use glam::DVec3;
 
+use super::corner_copies::{CornerCopies, Doubled};
+use super::cut_cubes::{CutCubes, gather_cut};
 use super::neo_hookean::{NeoHookean, Patterns, Stress, side};
 use super::places::SolidPlaces;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::{Run, Scalar, Vector};
 use crate::kernel::real::Real;
-use crate::kernel::region::Region;
+use crate::kernel::region::{Region, tile_of};
 use crate::kernel::stage::{ANY, Stage};
 
 /// Columns of which the sweep knows together whether there is a cube.
@@ -91,6 +96,10 @@ pub(crate) struct SolidTables<T> {
     groups: Vec<u8>,
     /// The columns of each row that have corners or act on some, in whole blocks.
     spans: Vec<Range<usize>>,
+    /// The tiles that have corners.
+    tiles: Vec<usize>,
+    /// The cubes beside cuts, once there is one.
+    cut: Option<Box<CutCubes<T>>>,
     buffers: RefCell<Buffers<T>>,
 }
 
@@ -138,6 +147,8 @@ impl<T: Real> SolidTables<T> {
             beds: Field::of_length(layout.plane),
             groups: vec![0; layout.plane.div_ceil(GROUP)],
             spans: vec![0..0; layout.rows],
+            tiles: Vec::new(),
+            cut: None,
             buffers: RefCell::new(Buffers::new(places, layout)),
         };
         let mut reached = vec![[usize::MAX, 0]; layout.rows];
@@ -163,7 +174,62 @@ impl<T: Real> SolidTables<T> {
                 *span = first / BLOCK * BLOCK..end.next_multiple_of(BLOCK);
             }
         }
+        let with_mass = (0..places.count()).filter(|place| places.mass(*place) > 0.0);
+        tables.tiles =
+            with_mass.map(|place| tile_of(layout, [place / layout.columns, place % layout.columns])).collect();
+        tables.tiles.sort_unstable();
+        tables.tiles.dedup();
         tables
+    }
+
+    /// Makes the tables those of a solid with these copies of corners.
+    pub(crate) fn follow(&mut self, places: &SolidPlaces, layout: &Layout, copies: Option<&CornerCopies>) {
+        if self.cut.is_some() {
+            *self = SolidTables::new(places, layout);
+        }
+        let Some(copies) = copies else { return };
+        for number in 0..copies.cubes().len() {
+            self.take_out(places, layout, copies, number);
+        }
+        let corners: Vec<usize> = copies.places().map(|place| copies.corner_of(place)).collect();
+        for place in corners.into_iter().chain(copies.places()) {
+            self.weigh(places, layout, copies, place);
+        }
+    }
+
+    /// Takes the copy of a corner into the tables.
+    pub(crate) fn double(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, doubled: &Doubled) {
+        for cube in doubled.cubes(places) {
+            if let Some(number) = copies.number_of(cube) {
+                self.take_out(places, layout, copies, number);
+            }
+        }
+        for place in [doubled.from, doubled.to] {
+            self.weigh(places, layout, copies, place);
+        }
+    }
+
+    /// Takes a cube out of its row.
+    fn take_out(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, number: usize) {
+        let cut = self.cut.get_or_insert_with(|| Box::new(CutCubes::none(layout)));
+        cut.set(places, layout, copies, number);
+        self.weights[layout.offset(copies.cubes()[number].cube as usize)] = T::default();
+    }
+
+    /// Sets the mass of a corner or a copy.
+    fn weigh(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, place: usize) {
+        let (at, mass) = (layout.offset(place), copies.mass(places, place));
+        self.masses[at] = T::of(mass);
+        self.mobility[at] = T::of(mass.recip());
+        self.beds[at] = T::of(places.bed(copies.corner_of(place)));
+        self.groups[at / GROUP] = self.groups[at / GROUP].max(CORNERS_ALONE);
+        let (span, column) = (&mut self.spans[place / layout.columns], place % layout.columns);
+        let block = column / BLOCK * BLOCK;
+        *span = if span.start == span.end {
+            block..block + BLOCK
+        } else {
+            span.start.min(block)..span.end.max(block + BLOCK)
+        };
     }
 }
 
@@ -196,15 +262,21 @@ impl<T: Real, S: Stage<T>> Run<T> for SolidSweep<'_, T, S> {
             buffers.stresses.len() == STRESS_VALUES * layout.stride + BLOCK && tables.weights.len() == layout.plane
         );
         buffers.clear();
-        let all_awake = self.over.awake.is_full();
+        // Tiles without corners never wake by themselves.
+        let all_awake = tables.tiles.iter().all(|tile| self.over.awake.has[*tile]);
         // SAFETY: the caller's promise, and the tables are those of the layout.
         unsafe {
             let mut sums = self.stage.begin::<V>();
+            if let Some(cut) = &tables.cut {
+                cut.pull::<V, S>(layout, self.grid.law, self.grid.x, self.over, &self.stage);
+            }
             for row in self.over.rows(rows + 1, layout.rows) {
                 // `black_box` hides the row from the compiler, which would otherwise keep an address for each array.
                 let place = [std::hint::black_box(row % rows), row / rows];
-                self.compute_stresses::<V>(place, &mut buffers, all_awake);
-                self.add_up::<V>(place, &mut buffers, all_awake);
+                if row < places.corner_rows() {
+                    self.compute_stresses::<V>(place, &mut buffers, all_awake);
+                    self.add_up::<V>(place, &mut buffers, all_awake);
+                }
                 self.hand_over::<V>(place, &buffers, all_awake, &mut sums);
                 self.stage.end_row();
             }
@@ -375,8 +447,9 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
         all_awake: bool,
         sums: &mut [V; 2],
     ) {
-        let SolidGrid { layout: Layout { stride, plane, .. }, places, tables, load, x, .. } = self.grid;
+        let SolidGrid { layout: ref layout @ Layout { stride, plane, .. }, places, tables, load, x, .. } = self.grid;
         let (row, forces) = (k * places.rows_per_plane() + j, buffers.stresses.as_ptr());
+        let is_of_lattice = row < places.corner_rows();
         // SAFETY: the caller's promise.
         unsafe {
             let zero = V::of(T::default());
@@ -388,8 +461,15 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
                     let at = row * stride + column;
                     let mobility = V::load(tables.mobility.as_ptr().add(at));
                     let (mut here, mut n) = ([zero; 3], [zero; 3]);
+                    let of_cut = if let Some(cut) = &tables.cut { cut.forces_at::<V>(layout, row, at) } else { None };
                     for c in 0..3 {
-                        n[c] = V::load(forces.add(STRESS_VALUES * column + c * V::LANES)).mul(mobility);
+                        if is_of_lattice {
+                            n[c] = V::load(forces.add(STRESS_VALUES * column + c * V::LANES));
+                        }
+                        if let Some(of_cut) = of_cut {
+                            n[c] = n[c].add(of_cut[c]);
+                        }
+                        n[c] = n[c].mul(mobility);
                         here[c] = V::load(x.add(c * plane + at));
                     }
                     if load.acts {
@@ -419,6 +499,7 @@ impl<T: Real, S: Stage<T>> SolidSweep<'_, T, S> {
 #[inline(always)]
 pub(crate) fn gather<T: Real>(
     places: &SolidPlaces,
+    copies: Option<&CornerCopies>,
     law: &NeoHookean<T>,
     load: &PointLoad<T>,
     layout: &Layout,
@@ -434,7 +515,8 @@ pub(crate) fn gather<T: Real>(
                 let corners = places.corners_of(cube).map(|corner| layout.offset(corner));
                 let patterns =
                     Patterns::of_corners(&corners.map(|at| [0, 1, 2].map(|c| Scalar(u[c * layout.plane + at]))));
-                law.stress(Scalar(T::of(places.weight(cube))), &patterns)
+                let is_cut = copies.is_some_and(|copies| copies.number_of(cube).is_some());
+                law.stress(if is_cut { zero } else { Scalar(T::of(places.weight(cube))) }, &patterns)
             })
         });
         for below in 0..2 {
@@ -446,7 +528,10 @@ pub(crate) fn gather<T: Real>(
             }
         }
     }
-    let mobility = if places.mass(place) > 0.0 { Scalar(T::of(places.mass(place).recip())) } else { zero };
+    let mass = copies.map_or(places.mass(place), |copies| copies.mass(places, place));
+    let mobility = if mass > 0.0 { Scalar(T::of(mass.recip())) } else { zero };
+    let of_cut = copies.map(|copies| gather_cut(places, copies, law, layout, u, place));
+    let bed = places.bed(copies.map_or(place, |copies| copies.corner_of(place)));
     let mut found = [T::default(); 3];
     for c in 0..3 {
         let [[even, odd], [even_before, odd_before]] = [0, 1].map(|beside| {
@@ -454,10 +539,14 @@ pub(crate) fn gather<T: Real>(
                 [0, 1].map(|below| sides[beside][below][c]);
             [all_below.add(z_below).add(all.sub(z)), x_below.add(xz_below).add(x.sub(xz))]
         });
-        let mut force = odd.sub(even).sub(even_before.add(odd_before)).mul(mobility);
-        if load.acts && places.mass(place) > 0.0 {
+        let mut force = odd.sub(even).sub(even_before.add(odd_before));
+        if let Some(of_cut) = of_cut {
+            force = force.add(Scalar(of_cut[c]));
+        }
+        force = force.mul(mobility);
+        if load.acts && mass > 0.0 {
             let x = Scalar(u[c * layout.plane + layout.offset(place)]);
-            force = force.add(load.force(c, Scalar(T::of(places.bed(place))), x));
+            force = force.add(load.force(c, Scalar(T::of(bed)), x));
         }
         found[c] = force.0;
     }

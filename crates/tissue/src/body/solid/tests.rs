@@ -10,7 +10,7 @@ use super::linear_cells::{LinearCells, resisting};
 use super::neo_hookean::{NeoHookean, Patterns};
 use crate::body::Places;
 use crate::body::model::{Model, Plan};
-use crate::body::severed::Severed;
+use crate::body::severed::SeveredSpring;
 use crate::body::tables::{SweepTables, springs_of};
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::lanes::{self, Scalar, Vector};
@@ -156,18 +156,42 @@ impl<T: Real> Stage<T> for Kept<'_, T> {
     }
 }
 
-fn a_point_has_the_bits_of_a_sweep<T: Real>() {
+/// Severs faces of a solid at random. Returns how many.
+fn sever_some<T: Real>(model: &Model, tables: &mut SweepTables<T>, count: usize) -> usize {
+    let mut random = fastrand::Rng::with_seed(7);
+    let mut severed = 0;
+    for version in 1..=count {
+        let places = model.places.solid().unwrap();
+        let (cube, axis) = (random.usize(..places.count()), random.usize(..3));
+        let Some(other) = places.cube_across(cube, axis, true).filter(|_| tables.severed.has_room(model)) else {
+            continue;
+        };
+        let [cube, other, number] = [cube, other, 2 * axis].map(|of| of as u32);
+        let face = SeveredSpring { ends: [cube, other], number, part: 0.5, version: version as u32 };
+        severed += usize::from(tables.sever(model, face).is_some());
+    }
+    severed
+}
+
+fn a_point_has_the_bits_of_a_sweep<T: Real>(cuts: usize) {
+    let mut of_widths = Vec::new();
     for lanes in [Lanes::Plain, Lanes::Avx2, Lanes::Avx512, Lanes::Neon].into_iter().filter_map(lanes::available) {
         let model = organ(lanes);
         let layout = Layout::new::<T>(model.points);
         let springs = springs_of::<T>(&model, &model.plan);
-        let tables = SweepTables::new(&model, layout, springs.clone());
+        let mut tables = SweepTables::new(&model, layout, springs.clone());
+        let severed = sever_some(&model, &mut tables, cuts);
+        assert!(severed >= cuts / 8, "{severed}");
         let mut u = Field::<T>::zero(&layout);
-        for point in model.points() {
-            let (at, place) = (model.place_of(point), model.shape().rest_m(point) / model.unit_m);
+        let copies: Vec<usize> = tables.severed.copies().map_or(Vec::new(), |copies| copies.places().collect());
+        assert!(copies.len() >= cuts / 40, "{}", copies.len());
+        let places: Vec<usize> = model.points().map(|point| model.place_of(point)).chain(copies).collect();
+        for at in &places {
+            let corner = tables.severed.copies().map_or(*at, |copies| copies.corner_of(*at));
+            let place = model.shape().rest_m(model.point_at(corner)) / model.unit_m;
             for c in 0..3 {
-                u[c * layout.plane + layout.offset(at)] =
-                    T::of(0.2 * (place.dot(DVec3::new(1.3, 0.7, -1.1)) + c as f64).sin());
+                u[c * layout.plane + layout.offset(*at)] =
+                    T::of(0.2 * (place.dot(DVec3::new(1.3, 0.7, -1.1)) + c as f64 + 1e-3 * *at as f64).sin());
             }
         }
         let mut region = Region::none(&layout);
@@ -178,9 +202,10 @@ fn a_point_has_the_bits_of_a_sweep<T: Real>() {
         unsafe { tables.survey(u.as_ptr(), &region, Kept { plane: layout.plane, forces: &forces }) };
         let forces = forces.into_inner();
         let mut largest: f64 = 0.0;
-        for point in model.points() {
-            let place = model.place_of(point);
-            let one = springs.gather(&Severed::default(), &layout, &u, 0.0, model.point_of(place));
+        let mut mass = 0.0;
+        for place in places.iter().copied() {
+            mass += tables.relative_mass_at(&model, place);
+            let one = springs.gather(&tables.severed, &layout, &u, 0.0, model.point_of(place));
             for c in 0..3 {
                 let of_sweep = forces[c * layout.plane + layout.offset(place)].wide();
                 assert_eq!(
@@ -193,13 +218,24 @@ fn a_point_has_the_bits_of_a_sweep<T: Real>() {
             }
         }
         assert!(largest > 0.0);
+        let whole: f64 = model.points().map(|point| model.scene.relative_mass(point)).sum();
+        assert!((mass / whole - 1.0).abs() < 1e-12, "{mass} of {whole}");
+        of_widths.push(forces.iter().map(|force| force.wide().to_bits()).collect::<Vec<_>>());
+    }
+    if cuts > 0 {
+        let at = |lanes: &Vec<u64>| lanes.iter().copied().fold(0_u64, |sum, bits| sum.rotate_left(1) ^ bits);
+        let mut sums: Vec<u64> = of_widths.iter().map(at).collect();
+        sums.dedup();
+        assert_eq!(sums.len(), 1);
     }
 }
 
 #[test]
-fn a_point_has_the_bits_of_a_sweep_at_every_width() {
-    a_point_has_the_bits_of_a_sweep::<f32>();
-    a_point_has_the_bits_of_a_sweep::<f64>();
+fn a_point_has_the_bits_of_a_sweep_at_every_width_also_beside_cuts() {
+    for cuts in [0, 200] {
+        a_point_has_the_bits_of_a_sweep::<f32>(cuts);
+        a_point_has_the_bits_of_a_sweep::<f64>(cuts);
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
-use crate::body::disc::TissueDisc;
+use crate::body::disc::{DiscPoint, TissueDisc};
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::MeshShape;
 use crate::shape::PointId;
@@ -158,9 +158,10 @@ impl TissueDisc for MeshDisc {
         Some(self.disc.weight_of(vertex.index() as u32))
     }
 
-    fn cover(&mut self, add: &mut dyn FnMut(PointId, f64, DVec2)) {
+    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
         self.disc.lay(self.shape.surface(), &self.place);
         let covered = self.disc.covered().iter();
-        covered.for_each(|covered| add(PointId::new(covered.vertex as usize), covered.weight, covered.gradient));
+        let point = |vertex: u32| PointId::new(vertex as usize).into();
+        covered.for_each(|covered| add(point(covered.vertex), covered.weight, covered.gradient));
     }
 }

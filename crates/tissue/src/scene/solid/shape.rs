@@ -140,7 +140,7 @@ impl SolidShape {
     }
 
     /// Returns a block of `cells`³ full cubes whose lowest points are fixed.
-    pub(super) fn block(cells: usize, edge_m: f64) -> Self {
+    pub(crate) fn block(cells: usize, edge_m: f64) -> Self {
         let lattice = Lattice { origin_m: DVec3::ZERO, edge_m, cells: [cells; 3] };
         let side_m = cells as f64 * edge_m;
         let corner_m = |[x, y, z]: [usize; 3]| side_m * DVec3::new(x as f64, y as f64, z as f64);
@@ -280,6 +280,11 @@ impl SolidShape {
     /// Returns the part of each cube that counts for mass; 0 for a cube outside.
     pub(super) fn mass_parts(&self) -> Vec<f64> {
         (0..self.parts.len()).map(|cell| self.mass_part(cell)).collect()
+    }
+
+    /// Returns the part that counts for mass of the cube of which a corner is the least one.
+    pub(crate) fn mass_part_at(&self, corner: usize) -> f64 {
+        self.mass_part(self.lattice.index(self.corner_at(corner)))
     }
 
     fn mass_part(&self, cell: usize) -> f64 {

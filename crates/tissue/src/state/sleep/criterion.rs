@@ -137,6 +137,11 @@ pub(crate) fn put_to_sleep<T: Real>(
     let creep = creep * tiles.largest;
     let slow = |epsilon: f64| (epsilon * restoring.sqrt()).max(creep);
     let settled = tiles.quiescent_tiles(&state.u, &state.d, forget(&relaxation, model.scene.stepping.rate_hz), slow);
+    // A solid with cuts sleeps as a whole (`state::step`).
+    let is_cut = tables.severed.copies().is_some();
+    if is_cut && (settled.len() < tiles.region.tiles().len() || !held.is_empty()) {
+        return;
+    }
     let epsilon = tiles.epsilon();
     let scale = plan.scheme.spring_scale();
     let forces = Forces {
@@ -157,7 +162,7 @@ pub(crate) fn put_to_sleep<T: Real>(
             sleepers.push((tile, survey));
         }
     }
-    if sleepers.is_empty() {
+    if sleepers.is_empty() || is_cut && sleepers.len() < tiles.region.tiles().len() {
         return;
     }
     tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));

@@ -100,6 +100,8 @@ pub(crate) struct SleepTiles<T> {
     /// Number of rows over which a spring reaches.
     reach: usize,
     graph: TileGraph,
+    /// Rows that have points.
+    rows: usize,
     /// Number of points.
     points: usize,
     /// The sleep tolerance; at 0 nothing sleeps.
@@ -134,15 +136,17 @@ impl<T: Real> SleepTiles<T> {
     /// Creates the tiles of a tissue at rest: all asleep if there is a tolerance, otherwise all awake forever.
     pub(crate) fn new(layout: Layout, model: &Model) -> Self {
         let graph = TileGraph::of(layout, model);
-        SleepTiles::asleep(layout, model.tile_tolerance(), model.spring_rows(), graph, model.len())
+        let sizes = [model.rows_of_points(), model.len()];
+        SleepTiles::asleep(layout, model.tile_tolerance(), model.spring_rows(), graph, sizes)
     }
 
-    fn asleep(layout: Layout, tolerance: f64, reach: usize, graph: TileGraph, points: usize) -> Self {
+    fn asleep(layout: Layout, tolerance: f64, reach: usize, graph: TileGraph, [rows, points]: [usize; 2]) -> Self {
         let count = tiles(layout.rows) * tiles(layout.columns);
         let mut tiles = SleepTiles {
             layout,
             reach,
             graph,
+            rows,
             points,
             tolerance,
             region: Region::none(&layout),
@@ -307,12 +311,17 @@ impl<T: Real> SleepTiles<T> {
         self.awake_points = 0;
         for tile in self.region.tiles() {
             let [rows, columns] = sides_of(&self.layout, *tile);
-            self.awake_points += rows.len() * columns.len();
+            self.awake_points += self.with_points(rows).len() * columns.len();
             self.touched.add(*tile);
         }
         self.graph.watch(&self.region.awake, &mut self.watches);
         // The last tile of a mesh has empty places.
         self.awake_points = self.awake_points.min(self.points);
+    }
+
+    /// Returns those of a tile's rows that have points; of a tile of spare places, all.
+    fn with_points(&self, rows: Range<usize>) -> Range<usize> {
+        if rows.start < self.rows { rows.start..rows.end.min(self.rows) } else { rows }
     }
 
     /// Wakes the sleeping tiles among `which`.
@@ -435,6 +444,7 @@ impl<T: Real> SleepTiles<T> {
         let Layout { stride, plane, .. } = self.layout;
         let most = |field: &Field<T>, tile: usize| {
             let [rows, columns] = sides_of(&self.layout, tile);
+            let rows = self.with_points(rows);
             let of = |range: &Range<usize>| [range.start, range.start + range.len() / 2, range.end - 1];
             let mut most = 0.0_f64;
             for i in of(&rows) {

@@ -18,7 +18,7 @@ fn layout() -> Layout {
 
 fn asleep<T: Real>(tolerance: f64) -> SleepTiles<T> {
     let graph = TileGraph::Sheet(SheetTiles::new(layout(), 1));
-    SleepTiles::asleep(layout(), tolerance, 1, graph, POINTS[0] * POINTS[1])
+    SleepTiles::asleep(layout(), tolerance, 1, graph, [POINTS[0], POINTS[0] * POINTS[1]])
 }
 
 /// All asleep.

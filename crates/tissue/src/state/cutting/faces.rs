@@ -1,0 +1,192 @@
+//! Blades in solids: which faces between cubes they cross, and what becomes of the corners of these cubes.
+//!
+//! A face is severed if the edge crosses the line between the middles of its cubes. A cube's middle is the mean of its
+//! corners. A doubled corner's copies begin where it is, with its velocity, so severing neither takes nor gives energy: what opens the
+//! cut afterwards was stored in the cubes.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use super::{Crossing, EdgeSweep};
+use crate::body::severed::SeveredSpring;
+use crate::body::solid::SolidPlaces;
+use crate::body::spring_ends::SpringEnd;
+use crate::kernel::real::Real;
+use crate::kernel::region::sides_of;
+use crate::state::tissue_state::TissueState;
+
+/// How far beyond a sweep's box the middles of cubes are looked for, in edges: faces are found from the lower one of their cubes.
+const REACH: f64 = 2.0;
+
+/// How much farther a cube's middle may be than its least corner shows, in edges.
+const SLACK: f64 = 0.75;
+
+/// The axes.
+const AXES: usize = 3;
+
+impl<T: Real> TissueState<T> {
+    /// Returns the faces that a blade crosses, from the lower one of their cubes; some perhaps twice.
+    pub(super) fn crossed_faces(&self, sweep: &EdgeSweep) -> Vec<Crossing> {
+        let TissueState { model, tables, state, tiles, spring_search, .. } = self;
+        let (Some(search), Some(places)) = (spring_search, model.places.solid()) else { return Vec::new() };
+        let (layout, mut found) = (&tables.layout, Vec::new());
+        let [least_m, most_m] = sweep.bounds_m();
+        let is_near = |place_m: DVec3, edges: f64| {
+            let reach_m = edges * model.unit_m;
+            place_m.cmpge(least_m - reach_m).all() && place_m.cmple(most_m + reach_m).all()
+        };
+        // By the displacement of the least corner alone.
+        let is_roughly_near = |cube: usize, corner: usize| {
+            is_near(model.end_at_rest_m(cube) + model.unit_m * self.vector(&state.u, corner), REACH + SLACK)
+        };
+        for tile in 0..tiles.tile_count() {
+            let [low_m, high_m] = search.tile_box_m(model, layout, state, &tiles.moved, tile);
+            let reach_m = (REACH + SLACK) * model.unit_m;
+            if high_m.cmplt(least_m - reach_m).any() || low_m.cmpgt(most_m + reach_m).any() {
+                continue;
+            }
+            let [rows, columns] = sides_of(layout, tile);
+            for row in rows {
+                for column in columns.clone() {
+                    let cube = row * layout.columns + column;
+                    if places.weight(cube) > 0.0 && is_roughly_near(cube, cube) {
+                        self.crossed_faces_of(places, cube, sweep, &is_near, &mut found);
+                    }
+                }
+            }
+        }
+        // Beside a cut, a cube may be anywhere.
+        let cut = tables.severed.copies().map_or(&[][..], |copies| copies.cubes());
+        for cube in cut.iter().filter(|cube| is_roughly_near(cube.cube as usize, cube.corners[0] as usize)) {
+            self.crossed_faces_of(places, cube.cube as usize, sweep, &is_near, &mut found);
+        }
+        found
+    }
+
+    /// Adds the faces of a cube with the higher coordinate that a blade crosses.
+    fn crossed_faces_of(
+        &self,
+        places: &SolidPlaces,
+        cube: usize,
+        sweep: &EdgeSweep,
+        is_near: &impl Fn(DVec3, f64) -> bool,
+        found: &mut Vec<Crossing>,
+    ) {
+        let TissueState { model, tables, .. } = self;
+        let [u_m, way_m] = self.middle_motion_m(places, cube);
+        let middle_m = model.end_at_rest_m(cube) + u_m;
+        if !is_near(middle_m, REACH) {
+            return;
+        }
+        let [least_m, most_m] = sweep.bounds_m();
+        for axis in 0..AXES {
+            let number = 2 * axis;
+            let Some(other) = places.cube_across(cube, axis, true) else { continue };
+            if tables.severed.has(model.first_end(cube) + number) {
+                continue;
+            }
+            let [other_u_m, other_way_m] = self.middle_motion_m(places, other);
+            let span_m = model.unit_m * DVec3::AXES[axis] + (other_u_m - u_m);
+            let moved_m = 0.5 * (way_m + other_way_m);
+            let (low_m, high_m) = (span_m.min(DVec3::ZERO), span_m.max(DVec3::ZERO));
+            let slack_m = moved_m.abs();
+            if (middle_m + high_m + slack_m).cmplt(least_m).any() || (middle_m + low_m - slack_m).cmpgt(most_m).any() {
+                continue;
+            }
+            if let Some(part) = sweep.crosses(middle_m, span_m, moved_m) {
+                let rest = DVec3::AXES[axis];
+                let spring = SpringEnd { number, other, rest, stiffness_n_per_m: 0.0, tension_n_per_m: 0.0 };
+                found.push(Crossing { place: cube, spring, part });
+            }
+        }
+    }
+
+    /// Returns the displacement of the middle of a cube and its way in this step, m.
+    fn middle_motion_m(&self, places: &SolidPlaces, cube: usize) -> [DVec3; 2] {
+        let TissueState { model, plan, tables, state, .. } = self;
+        let corners = match tables.severed.copies() {
+            Some(copies) => copies.corners_of(places, cube),
+            None => places.corners_of(cube),
+        };
+        let (mut u, mut d) = (DVec3::ZERO, DVec3::ZERO);
+        for corner in corners {
+            u += self.vector(&state.u, corner);
+            d += self.vector(&state.d, corner);
+        }
+        let eighth_m = 0.125 * model.unit_m;
+        [eighth_m * u, eighth_m * f64::from(plan.substeps) * d]
+    }
+
+    /// Returns the value of a field at a place.
+    #[inline]
+    fn vector(&self, field: &[T], place: usize) -> DVec3 {
+        let layout = &self.tables.layout;
+        let at = layout.offset(place);
+        let component = |c: usize| field[c * layout.plane + at].wide();
+        DVec3::new(component(0), component(1), component(2))
+    }
+
+    /// Severs a face. Returns whether it was whole, and there was room for the corners that this doubles.
+    pub(super) fn sever_face(&mut self, face: SeveredSpring) -> bool {
+        let model = self.model.clone();
+        if !self.tables.severed.has_room(&model) {
+            return false;
+        }
+        let before = self.forces_around(face.ends);
+        let Some(doubled) = self.tables.sever(&model, face) else { return false };
+        // A solid with cuts is awake as a whole, or asleep.
+        self.tiles.wake_all();
+        let layout = self.tables.layout;
+        for copy in &doubled {
+            let [from, to] = [copy.from, copy.to].map(|place| layout.offset(place));
+            for field in self.state.fields_mut() {
+                for c in 0..3 {
+                    field[c * layout.plane + to] = field[c * layout.plane + from];
+                }
+            }
+        }
+        // Of a multistep scheme's past forces, as if the face had always been severed.
+        let history = self.plan.scheme.history();
+        for copy in &doubled {
+            let known = before.iter().find(|(place, _)| *place == copy.from);
+            let Some((_, then)) = known else { continue };
+            for place in [copy.from, copy.to] {
+                let now = self.force_at(place);
+                for kept in &mut self.state.kept[..history] {
+                    let kept = Arc::make_mut(kept);
+                    for c in 0..3 {
+                        kept[c * layout.plane + layout.offset(place)] += T::of(now[c] - then[c]);
+                    }
+                }
+            }
+        }
+        true
+    }
+
+    /// Returns the corners that two neighbouring cubes share, with the force on each divided by its mass, in the scheme's units.
+    fn forces_around(&self, cubes: [u32; 2]) -> Vec<(usize, [f64; 3])> {
+        if self.plan.scheme.history() == 0 {
+            return Vec::new();
+        }
+        let Some(places) = self.model.places.solid() else { return Vec::new() };
+        let [first, second] = cubes.map(|cube| match self.tables.severed.copies() {
+            Some(copies) => copies.corners_of(places, cube as usize),
+            None => places.corners_of(cube as usize),
+        });
+        first
+            .into_iter()
+            .filter(|corner| second.contains(corner))
+            .map(|corner| (corner, self.force_at(corner)))
+            .collect()
+    }
+
+    fn force_at(&self, place: usize) -> [f64; 3] {
+        let TissueState { model, tables, state, .. } = self;
+        let point = model.point_of(place);
+        tables.springs.gather(&tables.severed, &tables.layout, &state.u, 0.0, point).map(Real::wide)
+    }
+}
+
+#[cfg(test)]
+mod tests;
