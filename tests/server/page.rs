@@ -211,7 +211,10 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
     let session_id = server.paper(true).await;
     let mut sessions = server.sessions().await;
     let listed = sessions.list_scripts(pb::ListScriptsRequest::default()).await.unwrap().into_inner().script_names;
-    assert_eq!(listed, ["cut", "grasp", "lift", "oblique-100", "oblique-60", "press", "push", "stroke", "vertical-60"]);
+    assert_eq!(
+        listed,
+        ["cut", "cut-solid", "grasp", "lift", "oblique-100", "oblique-60", "press", "push", "stroke", "vertical-60"]
+    );
     let limits = Limits::default();
     let scene = Scene::load(&repository().join("scenes/paper.toml"), &[], &limits).unwrap();
     // `lift` samples vertices, which a sheet has none of.

@@ -11,7 +11,8 @@ use std::ops::Range;
 use glam::DVec3;
 
 use crate::body::model::Model;
-use crate::kernel::field::{Field, Layout};
+use crate::body::solid::corner_copies::CornerCopies;
+use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::lanes::{Vector, Width};
 use crate::kernel::real::Real;
 use crate::scene::profile::Poke;
@@ -111,17 +112,23 @@ impl<T: Real> Term<T> {
 
     /// Writes the falloff of `poke` to the table. Costs as much as the points that the old and the new falloff
     /// reach.
-    pub(crate) fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
+    pub(crate) fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout, copies: Option<&CornerCopies>) {
         // Beyond its spans the table is 0, also where it was longer before.
         for (row, span) in self.factors.chunks_exact_mut(layout.stride).zip(&self.spans) {
             row[span.clone()].fill(T::default());
         }
         [self.rows, self.columns] = model.places.reached::<T>(poke).map(|[from, to]| from..to);
+        if let Some(copies) = copies.filter(|_| !self.rows.is_empty()) {
+            // Copies are in the last rows.
+            self.rows.end = self.rows.end.max(copies.end().div_ceil(layout.columns));
+            self.columns = 0..layout.columns.next_multiple_of(BLOCK);
+        }
         // `libm` gives the same bits on every machine; the platform's exponential does not.
         self.gain = libm::exp(poke.falloff_offset);
         self.factors.resize(self.rows.len() * layout.stride);
         let points = [self.rows.clone(), self.columns.clone()];
-        model.places.fall_off(Width::of(model.lanes), poke, layout, points, &mut self.factors, &mut self.spans);
+        let (width, spans) = (Width::of(model.lanes), &mut self.spans);
+        model.places.fall_off(width, (poke, copies), layout, points, &mut self.factors, spans);
     }
 
     pub(crate) fn set(&mut self, wanted: FalloffForces, scale: f64) {

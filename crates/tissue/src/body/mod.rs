@@ -34,6 +34,7 @@ use disc::TissueDisc;
 use sheet::falloff::SheetPoints;
 use sheet::footprint::GridDisc;
 use solid::SolidPlaces;
+use solid::corner_copies::CornerCopies;
 use solid::footprint::SolidDisc;
 use surface::footprint::MeshDisc;
 use surface::{MeshPlaces, VolumePlaces};
@@ -212,11 +213,11 @@ impl Places {
     }
 
     /// Writes the falloff of `poke`, e^(−c·r) divided by the relative mass, over some rows and columns, with whole rows
-    /// in `factors`, and which part of each row is not 0.
+    /// in `factors`, and which part of each row is not 0. `copies` are those of a solid with cuts.
     pub(crate) fn fall_off<T: Real>(
         &self,
         width: Width,
-        poke: &Poke,
+        (poke, copies): (&Poke, Option<&CornerCopies>),
         layout: &Layout,
         [rows, columns]: [Range<usize>; 2],
         factors: &mut Field<T>,
@@ -225,7 +226,7 @@ impl Places {
         match self {
             Places::Sheet(points) => points.fall_off(width, poke, layout, [rows, columns], factors, spans),
             Places::Surface(places) => places.fall_off(poke, layout, rows, factors, spans),
-            Places::Solid(places) => places.fall_off(poke, layout, [rows, columns], factors, spans),
+            Places::Solid(places) => places.fall_off((poke, copies), layout, [rows, columns], factors, spans),
         }
     }
 

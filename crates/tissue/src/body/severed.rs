@@ -39,6 +39,8 @@ pub struct Cuts {
     version: u32,
     /// The version since which springs were severed only, and none became whole again.
     grows_since: u32,
+    /// The corners of a solid that these cuts double; `None` without any, and for other tissues.
+    copies: Option<Arc<CornerCopies>>,
 }
 
 /// A spring that is severed, by its points ([`Cuts::joints`]).
@@ -126,11 +128,35 @@ impl Cuts {
         self.springs.iter().zip(&*other.springs).take_while(|(one, other)| one == other).count()
     }
 
-    /// Returns the first `count` springs.
-    pub(crate) fn first(&self, count: usize) -> Self {
-        let springs = &self.springs[..count.min(self.springs.len())];
-        let version = springs.last().map_or(0, |last| last.version);
-        Cuts { version, grows_since: self.grows_since, springs: Arc::new(springs.to_vec()) }
+    /// Returns the cuts of the first `count` springs.
+    pub(crate) fn first(&self, count: usize, model: &Model) -> Self {
+        let mut first = Severed::default();
+        for spring in &self.springs[..count.min(self.springs.len())] {
+            first.add(model, *spring);
+        }
+        let version = self.springs[..first.len()].last().map_or(0, |last| last.version);
+        Cuts { version, grows_since: self.grows_since, ..first.cuts }
+    }
+
+    /// Returns the doubled corners of a solid; `None` if nothing is severed, and for other tissues.
+    pub(crate) fn copies(&self) -> Option<&Arc<CornerCopies>> {
+        self.copies.as_ref()
+    }
+
+    /// Returns where the corners of a cell of a solid are in [`Tissue::shown_displacements_m`](crate::Tissue::shown_displacements_m), x before
+    /// y before z, if a cut has doubled any of them. `least` is the point at its least corner.
+    pub fn doubled_corners(&self, model: &Model, least: PointId) -> Option<[u32; 8]> {
+        let copies = self.copies.as_ref()?;
+        copies.number_of(model.place_of(least)).map(|number| copies.cubes()[number].corners)
+    }
+
+    /// Returns whether one more spring can be severed: a solid has spare places for so many doubled corners.
+    pub fn has_room(&self, model: &Model) -> bool {
+        match (&self.copies, model.places.solid()) {
+            (Some(copies), _) => copies.has_room(),
+            (None, Some(places)) => CornerCopies::fits_in(places),
+            (None, None) => true,
+        }
     }
 
     /// Adds the springs to the hash of a tissue; nothing if none is severed.
@@ -180,8 +206,6 @@ pub(crate) struct Severed {
     cuts: Cuts,
     /// A bit for each spring at each of its ends; empty if nothing is severed.
     ends: Vec<u64>,
-    /// The doubled corners of a solid; `None` if nothing is severed.
-    copies: Option<Arc<CornerCopies>>,
 }
 
 impl Deref for Severed {
@@ -211,20 +235,6 @@ impl Severed {
         self.ends.get(end / 64).is_some_and(|bits| bits >> (end % 64) & 1 != 0)
     }
 
-    /// Returns the doubled corners of a solid; `None` if nothing is severed, and for other tissues.
-    pub(crate) fn copies(&self) -> Option<&Arc<CornerCopies>> {
-        self.copies.as_ref()
-    }
-
-    /// Returns whether one more spring can be severed: a solid has spare places for so many doubled corners.
-    pub(crate) fn has_room(&self, model: &Model) -> bool {
-        match (&self.copies, model.places.solid()) {
-            (Some(copies), _) => copies.has_room(),
-            (None, Some(places)) => CornerCopies::none(places).has_room(),
-            (None, None) => true,
-        }
-    }
-
     /// Adds a spring. Returns the corners that this doubles, if the spring was whole.
     pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<Doubled>> {
         let [end, _] = spring.ends_of(model);
@@ -239,11 +249,11 @@ impl Severed {
     /// Doubles the corners that a severed face sets free.
     fn double(&mut self, model: &Model, face: &SeveredSpring) -> Vec<Doubled> {
         let Some(places) = model.places.solid() else { return Vec::new() };
-        let mut copies = self.copies.take().unwrap_or_else(|| Arc::new(CornerCopies::none(places)));
+        let mut copies = self.cuts.copies.take().unwrap_or_else(|| Arc::new(CornerCopies::none(places)));
         let is_severed = |cube: usize, axis: usize| self.has(model.first_end(cube) + 2 * axis);
         let doubled =
             Arc::make_mut(&mut copies).sever(places, face.ends[0] as usize, face.number as usize / 2, is_severed);
-        self.copies = Some(copies);
+        self.cuts.copies = Some(copies);
         doubled
     }
 
@@ -259,20 +269,11 @@ impl Severed {
         let changed = [&self.cuts, cuts].map(|cuts| cuts.springs[shared..].to_vec());
         let [whole, severed] = &changed;
         whole.iter().for_each(|spring| self.mark(model, spring, false));
-        // In a solid, what a face doubles depends on those before it.
-        let is_solid = model.places.solid().is_some();
-        if is_solid && !whole.is_empty() {
-            (self.ends, self.copies) = (Vec::new(), None);
-        }
-        let added = if is_solid && !whole.is_empty() { &cuts.springs[..] } else { severed };
-        for spring in added {
-            self.mark(model, spring, true);
-            self.double(model, spring);
-        }
+        severed.iter().for_each(|spring| self.mark(model, spring, true));
         let is_same = whole.is_empty() && severed.is_empty();
         let version = (self.cuts.version + u32::from(!is_same)).max(cuts.version);
         let grows_since = if is_same { self.cuts.grows_since.max(cuts.grows_since) } else { version };
-        self.cuts = Cuts { version, grows_since, springs: cuts.springs.clone() };
+        self.cuts = Cuts { version, grows_since, ..cuts.clone() };
         changed
     }
 

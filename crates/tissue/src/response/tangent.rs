@@ -215,8 +215,14 @@ impl<'m> LinearPatch<'m> {
         Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
 
-    /// Takes the severed springs away, of a patch in the tissue's own directions.
+    /// Takes the severed springs away, of a patch in the tissue's own directions; of a solid, the cubes with doubled corners, which are on
+    /// one side of a cut.
     pub(crate) fn without(mut self, cuts: &Cuts) -> Self {
+        if let (Elements::Cells(cells), Some(copies)) = (&mut self.elements, cuts.copies()) {
+            cells.retain(|cube| copies.number_of(cube).is_none());
+            self.linearise();
+            return self;
+        }
         let within = |place: u32| self.window.find(self.model, self.model.point_of(place as usize));
         let found = cuts.springs().iter().filter_map(|spring| {
             let [first, second] = spring.ends;

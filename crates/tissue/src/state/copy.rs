@@ -100,7 +100,7 @@ impl<T: Real> TissueState<T> {
         sheet.contacts.clone_from(&checkpoint.contacts);
         sheet.tiles.largest = checkpoint.largest;
         sheet.tables.set_severed(model, &checkpoint.cuts);
-        sheet.contacts.follow_cuts(model, sheet.tables.severed.copies());
+        sheet.follow_cuts();
         sheet
     }
 
@@ -128,6 +128,7 @@ impl<T: Real> TissueState<T> {
         sheet.prescribed.clone_from(&self.prescribed);
         sheet.contacts.clone_from(&self.contacts);
         sheet.tables.set_severed(model, self.tables.severed.cuts());
+        sheet.follow_cuts();
         sheet
     }
 

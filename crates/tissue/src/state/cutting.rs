@@ -120,16 +120,28 @@ impl<T: Real> TissueState<T> {
         let mut any = false;
         // Discs share the copies of corners, which change.
         self.contacts.follow_cuts(&self.model, None);
+        if self.tables.severed.copies().is_some() {
+            self.applied.follow_cuts(None);
+        }
         for crossing in crossings {
             any |= self.sever(&crossing, version);
         }
-        self.contacts.follow_cuts(&self.model, self.tables.severed.copies());
+        self.follow_cuts();
         if any {
             self.tables.severed.begin_version(version);
             // A twin that steps otherwise severs other springs: that is no error of the stepping.
             self.audit_window.give_up();
         }
         self.ended(StepStage::Contact);
+    }
+
+    /// Lets tools act on the copies of corners that there are now.
+    pub(super) fn follow_cuts(&mut self) {
+        let copies = self.tables.severed.copies().cloned();
+        self.contacts.follow_cuts(&self.model, copies.as_ref());
+        if copies.is_some() {
+            self.applied.follow_cuts(copies.as_ref());
+        }
     }
 
     /// Returns the springs that a blade crosses, from their first ends; some perhaps twice.

@@ -38,7 +38,7 @@ impl<T: Real> StepContext<'_, T> {
             tables.springs.gather(&tables.severed, &tables.layout, &state.u, volume_change, point).map(Real::wide);
         let scale = plan.force_scale(scene);
         let applied_n = applied.from(model, index, moment);
-        let (used, mass) = (applied.force_at(&tables.layout, 0, point), model.relative_mass_at(index));
+        let (used, mass) = (applied.force_at(&tables.layout, 0, point), tables.relative_mass_at(model, index));
         let mut changes = [[0.0; 2]; 3];
         for (c, change) in changes.iter_mut().enumerate() {
             let at = c * tables.layout.plane + tables.layout.offset(index);
@@ -86,7 +86,7 @@ impl Prescribed {
                 moved[c] = state.u[at].wide() - free_u.wide();
             }
             if counted {
-                work.add(product * model.relative_mass_at(index) * unit_j);
+                work.add(product * tables.relative_mass_at(model, index) * unit_j);
                 work.add(applied.work_along(model, plan, &tables.layout, model.point_of(index), moved) * unit_j);
             }
         }

@@ -220,8 +220,8 @@ impl<T: Real> TissueState<T> {
         self.contacts.clone_from(&checkpoint.contacts);
         self.work = checkpoint.work;
         self.tables.set_severed(&self.model, &checkpoint.cuts);
-        self.contacts.follow_cuts(&self.model, self.tables.severed.copies());
         let was = checkpoint.halvings;
+        self.follow_cuts();
         self.halve(was, halvings);
         self.tables.is_settled(0.0);
         self.tables.take_work();

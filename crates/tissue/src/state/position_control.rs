@@ -38,7 +38,7 @@ impl Contacts {
                 push(model, plan, layout, state, &tool.footprint, leg.jump_n, plan.scheme.kick());
             }
             let thrust = match tool.tip.shape {
-                TipShape::Blade => tool.resist(model, plan, layout, state, fraction),
+                TipShape::Blade => tool.resist(model, plan, layout, state, (fraction, tables.severed.has_room(model))),
                 _ => tool.solve_contact(model, plan, layout, state, leg),
             };
             tool.is_new = false;

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::{Model, Plan};
-use crate::body::severed::{Cuts, Severed};
+use crate::body::severed::Cuts;
 use crate::body::tables::springs_of;
 use crate::interface::Tissue;
 use crate::kernel::field::{Layout, State};
@@ -235,7 +235,7 @@ fn restored_as<T: Real>(
     sheet.tiles.restore(&parts.tiles)?;
     let cuts = Cuts::restored(&parts.severed, parts.topology_version, model)?;
     sheet.tables.set_severed(model, &cuts);
-    sheet.contacts.follow_cuts(model, sheet.tables.severed.copies());
+    sheet.follow_cuts();
 
     let size = size_of::<T>();
     ensure(values.len().is_multiple_of(size), "part of a value")?;
@@ -303,14 +303,18 @@ fn checkpoint_of<T: Real>(
     let severed = usize::try_from(saved.severed).unwrap_or(usize::MAX);
     ensure(severed <= tissue.tables.severed.len(), "more severed springs in its checkpoint than now")?;
     let scale = halved(model, saved.halvings).force_scale(&model.scene);
-    let cuts = tissue.tables.severed.first(severed);
+    let cuts = tissue.tables.severed.first(severed, model);
     let mut contacts = Contacts::restored(&saved.contacts, model, checks)?;
-    contacts.follow_cuts(model, Severed::of(&cuts, model).copies());
+    let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
+    contacts.follow_cuts(model, cuts.copies());
+    if cuts.copies().is_some() {
+        applied.follow_cuts(cuts.copies());
+    }
     Ok(Checkpoint {
         steps: saved.steps,
         halvings: saved.halvings,
         state,
-        applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
+        applied,
         prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
         contacts,
         work: WorkAccount::restored(&saved.work)?,

@@ -152,7 +152,7 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Returns a reader of points.
-    fn reader(&self) -> PointReader<'_, T> {
+    pub(super) fn reader(&self) -> PointReader<'_, T> {
         let TissueState { model, plan, tables, state, applied, prescribed, contacts, tiles, .. } = self;
         PointReader {
             model,
@@ -259,7 +259,7 @@ impl<T: Real> Tissue for TissueState<T> {
         let displacement_m = window.points(&self.model).map(displacement_m).collect();
         Some(TangentInput {
             model: self.model.clone(),
-            footprint: tool.footprint.clone(),
+            footprint: tool.footprint.clone().without_cuts(&self.model),
             window,
             displacement_m,
             cuts: self.tables.severed.cuts().clone(),

@@ -8,10 +8,14 @@
 //!
 //! `body::force_field` has the force of one tool over the points.
 
+use std::sync::Arc;
+
 use glam::DVec3;
 
+use crate::body::footprint::mass_at;
 use crate::body::force_field::{FalloffForces, ForceChange, Term, factor, same_falloff};
 use crate::body::model::{Model, Plan};
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::kernel::field::Layout;
 use crate::kernel::real::Real;
 use crate::saved::{
@@ -75,16 +79,18 @@ pub(crate) struct Applied<T: Real> {
     wanted: Vec<FalloffForces>,
     /// Whether the terms stay valid for the next steps.
     settled: bool,
+    /// The corners of a solid that cuts have doubled.
+    copies: Option<Arc<CornerCopies>>,
 }
 
 impl<T: Real> Applied<T> {
     pub(crate) fn new() -> Self {
-        Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true }
+        Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true, copies: None }
     }
 
     /// Returns the same forces for a tissue in this number format, without tables.
     pub(crate) fn like<S: Real>(other: &Applied<S>) -> Self {
-        Applied { slots: other.slots.clone(), settled: false, ..Applied::new() }
+        Applied { slots: other.slots.clone(), settled: false, copies: other.copies.clone(), ..Applied::new() }
     }
 
     /// Converts the forces to plain data, without tables.
@@ -142,11 +148,11 @@ impl<T: Real> Applied<T> {
             ensure(libm::exp(wanted.poke.falloff_offset).is_finite(), "a force that is not finite")?;
             is_sound(&wanted.poke, &wanted.forces_n)?;
             let mut term = Term::new();
-            term.place(&wanted.poke, model, layout);
+            term.place(&wanted.poke, model, layout, None);
             term.set(wanted, scale);
             terms.push(term);
         }
-        Ok(Applied { slots, terms, wanted: Vec::new(), settled: saved.settled })
+        Ok(Applied { slots, terms, wanted: Vec::new(), settled: saved.settled, copies: None })
     }
 
     /// Sets the force of `tool` from the next step on.
@@ -239,7 +245,7 @@ impl<T: Real> Applied<T> {
             });
             self.terms.swap(place, place + found);
             if known.is_none() {
-                self.terms[place].place(&wanted.poke, model, layout);
+                self.terms[place].place(&wanted.poke, model, layout, self.copies.as_deref());
             }
             self.terms[place].set(wanted, scale);
         }
@@ -251,7 +257,7 @@ impl<T: Real> Applied<T> {
         let pokes = self.slots.iter().filter_map(|slot| slot.before).filter(|poke| poke.force_n != DVec3::ZERO);
         let term = |poke: Poke| {
             let mut term = Term::new();
-            term.place(&poke, model, layout);
+            term.place(&poke, model, layout, self.copies.as_deref());
             term.set(FalloffForces { poke, forces_n: [poke.force_n; 3] }, scale);
             term
         };
@@ -283,13 +289,27 @@ impl<T: Real> Applied<T> {
         }
         let force = self.force_at(layout, plan.scheme.last_field(), point);
         let product: f64 = force.iter().zip(movement).map(|(force, moved)| force * moved).sum();
-        product * model.relative_mass_at(model.index_of(point))
+        product * mass_at(model, self.copies.as_deref(), model.index_of(point))
     }
 
     /// Discards the terms and their scale.
     pub(crate) fn forget(&mut self) {
         self.terms.clear();
         self.settled = false;
+    }
+
+    /// Lets the forces act on these copies of a solid's corners too: each gets the part of the force on its corner that its mass is of the
+    /// corner's.
+    pub(crate) fn follow_cuts(&mut self, copies: Option<&Arc<CornerCopies>>) {
+        self.copies = copies.cloned();
+        self.forget();
+    }
+
+    /// Returns the corner at a place in memory, and the part of the force on the corner that acts there.
+    fn share(&self, model: &Model, index: usize) -> (usize, f64) {
+        let Some(copies) = &self.copies else { return (index, 1.0) };
+        let corner = copies.corner_of(index);
+        (corner, mass_at(model, Some(copies), index) / model.relative_mass_at(corner))
     }
 
     /// Ends a step: the present force becomes the force before the next step.
@@ -304,12 +324,14 @@ impl<T: Real> Applied<T> {
     pub(crate) fn from(&self, model: &Model, index: usize, moment: Moment) -> DVec3 {
         let rate_hz = model.scene.stepping.rate_hz;
         let pokes = self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz)));
-        sum_at(model, index, pokes, T::NEGLIGIBLE_EXPONENT)
+        let (corner, part) = self.share(model, index);
+        part * sum_at(model, corner, pokes, T::NEGLIGIBLE_EXPONENT)
     }
 
     /// Returns the force on a point at the end of the last step, N.
     pub(crate) fn until(&self, model: &Model, index: usize) -> DVec3 {
-        sum_at(model, index, self.slots.iter().filter_map(|slot| slot.before), T::NEGLIGIBLE_EXPONENT)
+        let (corner, part) = self.share(model, index);
+        part * sum_at(model, corner, self.slots.iter().filter_map(|slot| slot.before), T::NEGLIGIBLE_EXPONENT)
     }
 }
 

@@ -25,14 +25,15 @@ impl Tool {
         if self.tip.shape == TipShape::Blade { COUPLING } else { self.tip.coupling }
     }
 
-    /// Determines the force of a blade on the tissue, N, at the end of a substep, which ends at `fraction` of the step.
+    /// Determines the force of a blade on the tissue, N, at the end of a substep, which ends at `fraction` of the step. A blade that finds no
+    /// room to cut only pushes.
     pub(crate) fn resist<T: Real>(
         &mut self,
         model: &Model,
         plan: &Plan,
         layout: &Layout,
         state: &State<T>,
-        fraction: f64,
+        (fraction, has_room): (f64, bool),
     ) -> ContactForce {
         let place_m = self.place_m(fraction);
         let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
@@ -62,7 +63,7 @@ impl Tool {
         let across_m = gap_m - gap_m.dot(edge) * edge;
         let thrust = self.thrust(model, plan, layout, state, across_m);
         let (force_n, wanted_n) = (thrust.force_n(), thrust.force_n().length());
-        if wanted_n <= most_n {
+        if wanted_n <= most_n || !has_room {
             self.contact_state = ContactState::Sticking;
             return thrust;
         }

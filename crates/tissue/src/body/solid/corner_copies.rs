@@ -82,6 +82,11 @@ impl CornerCopies {
         }
     }
 
+    /// Returns whether a solid without cuts has spare places for what one face doubles.
+    pub(crate) fn fits_in(places: &SolidPlaces) -> bool {
+        places.spare().len() >= CORNERS_OF_FACE
+    }
+
     /// Returns whether there are spare places for whatever one more face doubles.
     pub(crate) fn has_room(&self) -> bool {
         self.copies.len() + CORNERS_OF_FACE <= self.spare

@@ -21,6 +21,7 @@ const BEYOND: u32 = u32::MAX;
 /// A cube of the part.
 #[derive(Debug, Clone)]
 struct LinearCell {
+    cube: usize,
     /// The index of each corner among the points of the part.
     points: [u32; 8],
     weight: f64,
@@ -79,6 +80,7 @@ impl LinearCells {
         cubes.dedup();
         let index = |place: usize| part.binary_search(&place).map_or(BEYOND, |at| at as u32);
         let cell = |cube: usize| LinearCell {
+            cube,
             points: places.corners_of(cube).map(index),
             weight: places.weight(cube),
             cofactor: [[0.0; 3]; 3],
@@ -94,6 +96,11 @@ impl LinearCells {
     /// Returns the number of cubes.
     pub(crate) fn len(&self) -> usize {
         self.cells.len()
+    }
+
+    /// Keeps the cubes for which `keeps` is true, by their least corners.
+    pub(crate) fn retain(&mut self, keeps: impl Fn(usize) -> bool) {
+        self.cells.retain(|cell| keeps(cell.cube));
     }
 
     /// Computes the forces and their derivative at the present displacements of the part's points, m. Adds to `blocks`

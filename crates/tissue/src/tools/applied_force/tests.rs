@@ -24,8 +24,8 @@ fn a_table_keeps_nothing_of_the_place_before() {
             falloff_offset: 0.0,
         };
         let mut fresh = Term::<f32>::new();
-        fresh.place(&poke, &model, &layout);
-        term.place(&poke, &model, &layout);
+        fresh.place(&poke, &model, &layout, None);
+        term.place(&poke, &model, &layout, None);
         assert_eq!((&term.rows, &term.spans), (&fresh.rows, &fresh.spans));
         assert_eq!(*term.factors, *fresh.factors);
         let outside = |(row, span): (&[f32], &Range<usize>)| {

@@ -10,10 +10,11 @@ use crate::body::severed::SeveredSpring;
 use crate::interface::Tissue;
 use crate::kernel::lanes;
 use crate::limits::Limits;
+use crate::scene::profile::Poke;
 use crate::scene::{Body, Integrator, Lanes, Precision, Scene, Solid, SolidMaterial, SolidShape};
 use crate::scheme::Oscillator;
 use crate::state::tissue_state::TissueState;
-use crate::{Grasp, Model, at_rest, restored};
+use crate::{Grasp, Model, Push, at_rest, restored};
 use palpate_haptics::{Tip, TipShape};
 
 /// A block of 100 × 100 × 40 mm on a table, of cubes of 10 mm.
@@ -210,4 +211,47 @@ fn a_round_crack_opens_as_sneddon_says() {
     let ratio = opening_m / expected_m;
     println!("c = {:.2} cells: {ratio:.4} of the closed form", radius_m / edge_m);
     assert!(lips.len() == 2 && (0.85..1.15).contains(&ratio), "{lips:?} m, {expected_m} m: {ratio}");
+}
+
+/// A force on points beside a cut is divided among both sides as their mass is: together they weigh as much on the table as before.
+#[test]
+fn a_force_beside_a_cut_acts_on_both_sides() {
+    let model = block(&["stepping.precision=f64", "material.damping_per_s=200"]);
+    let weighed_n = |cuts: bool| {
+        let mut tissue = TissueState::<f64>::new(&model);
+        let poke = Poke {
+            point: None,
+            centre_m: DVec3::new(0.0, 0.0, 0.04),
+            force_n: -0.05 * DVec3::Z,
+            falloff_per_m: 80.0,
+            falloff_offset: 0.0,
+        };
+        tissue.push(1, Some(Push::Constant(poke)));
+        if cuts {
+            cut(&mut tissue, DVec3::new(0.001, -0.06, -0.01), DVec3::new(0.001, 0.06, -0.01), 150);
+            let copies = tissue.tables.severed.copies().unwrap();
+            for place in copies.places() {
+                let corner = copies.corner_of(place);
+                let [own, copy] = [corner, place].map(|place| tissue.applied.until(&model, place));
+                let whole = tissue.model.places.solid().unwrap().mass(corner);
+                let part = tissue.tables.relative_mass_at(&model, place) / whole;
+                assert!((copy - part * (own + copy)).length() < 1e-15 && copy.length() > 0.0, "{own} {copy} {part}");
+            }
+        }
+        (0..600).for_each(|_| tissue.step().unwrap());
+        model
+            .points()
+            .filter(|point| model.shape().is_fixed(*point))
+            .map(|point| {
+                let place = model.place_of(point);
+                let of = |place: usize| tissue.reader().point(place).spring_n.z + tissue.applied.until(&model, place).z;
+                let copies = tissue.tables.severed.copies();
+                let of_copies =
+                    copies.iter().flat_map(|copies| copies.places().filter(|copy| copies.corner_of(*copy) == place));
+                of(place) + of_copies.map(of).sum::<f64>()
+            })
+            .sum::<f64>()
+    };
+    let [whole_n, cut_n] = [weighed_n(false), weighed_n(true)];
+    assert!(whole_n < -0.5 && (cut_n / whole_n - 1.0).abs() < 1e-3, "{whole_n} {cut_n}");
 }
