@@ -16,6 +16,7 @@
 ("GetStateHashRequest", |bytes| <GetStateHashRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetTextureRequest", |bytes| <GetTextureRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetTopologyRequest", |bytes| <GetTopologyRequest as ::prost::Message>::decode(bytes).is_ok()),
+("GetWoundRequest", |bytes| <GetWoundRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListCallersRequest", |bytes| <ListCallersRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListFleetSessionsRequest", |bytes| <ListFleetSessionsRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListJournalsRequest", |bytes| <ListJournalsRequest as ::prost::Message>::decode(bytes).is_ok()),

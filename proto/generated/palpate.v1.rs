@@ -6468,6 +6468,117 @@ impl ::prost::Name for SeveredSpring {
     }
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetWoundRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// The refinement of the frames that show it.
+    #[prost(uint32, tag = "2")]
+    pub refinement: u32,
+    /// The version whose wound the client has: then only what is new since, if that is all that has changed. 0: everything.
+    #[prost(uint32, tag = "3")]
+    pub since_version: u32,
+}
+impl ::prost::Name for GetWoundRequest {
+    const NAME: &'static str = "GetWoundRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GetWoundRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GetWoundRequest".into()
+    }
+}
+/// A part of the wound. The lists of all parts, concatenated, are the whole.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetWoundResponse {
+    /// The version of what joins the points (GetTopology), which frames have.
+    #[prost(uint32, tag = "1")]
+    pub version: u32,
+    /// Whether the lists follow what the client has of `since_version`; otherwise the wound begins anew on the whole mesh.
+    #[prost(bool, tag = "2")]
+    pub continues: bool,
+    /// The index of the first of all new vertices in this answer. New vertices are numbered on from those of the mesh.
+    #[prost(uint32, tag = "3")]
+    pub first_vertex: u32,
+    #[prost(message, repeated, tag = "4")]
+    pub vertices: ::prost::alloc::vec::Vec<LipVertex>,
+    #[prost(message, repeated, tag = "5")]
+    pub triangles: ::prost::alloc::vec::Vec<CutTriangles>,
+    /// Number of severed springs.
+    #[prost(uint32, tag = "6")]
+    pub severed: u32,
+    /// Number of parts of the tissue; 1 if it is whole.
+    #[prost(uint32, tag = "7")]
+    pub pieces: u32,
+    /// Whether the mesh stays whole although springs are severed, because its vertices are not those that are simulated.
+    #[prost(bool, tag = "8")]
+    pub stays_whole: bool,
+    /// Whether this is the last part.
+    #[prost(bool, tag = "9")]
+    pub last: bool,
+}
+impl ::prost::Name for GetWoundResponse {
+    const NAME: &'static str = "GetWoundResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GetWoundResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GetWoundResponse".into()
+    }
+}
+/// A vertex of a lip of the wound. It moves as its host does: its position is its rest position plus the displacement of the host.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct LipVertex {
+    /// A vertex of the mesh.
+    #[prost(uint32, tag = "1")]
+    pub host: u32,
+    /// Two other vertices of the mesh. At rest it is at h + second_part·(s − h) + third_part·(t − h), of the host's rest position h and theirs, s
+    /// and t; its texture coordinates are found in the same way. Between two vertices third and third_part are 0.
+    #[prost(uint32, tag = "2")]
+    pub second: u32,
+    #[prost(uint32, tag = "3")]
+    pub third: u32,
+    #[prost(float, tag = "4")]
+    pub second_part: f32,
+    #[prost(float, tag = "5")]
+    pub third_part: f32,
+}
+impl ::prost::Name for LipVertex {
+    const NAME: &'static str = "LipVertex";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.LipVertex".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.LipVertex".into()
+    }
+}
+/// Triangles of the mesh that are no longer shown, and those in their place.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CutTriangles {
+    /// The number of the first in GetMesh, from 0. What a client was sent before with the same number is replaced.
+    #[prost(uint32, tag = "1")]
+    pub first: u32,
+    /// How many there are.
+    #[prost(uint32, tag = "2")]
+    pub count: u32,
+    /// Three vertices for each triangle in their place, counter-clockwise from outside; none if an earlier one has them. If the second or the
+    /// third is a new vertex, the side between these two is a lip of the wound.
+    #[prost(uint32, repeated, tag = "3")]
+    pub corners: ::prost::alloc::vec::Vec<u32>,
+}
+impl ::prost::Name for CutTriangles {
+    const NAME: &'static str = "CutTriangles";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.CutTriangles".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.CutTriangles".into()
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetTextureRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
@@ -6824,6 +6935,31 @@ pub mod view_service_client {
                 .insert(GrpcMethod::new("palpate.v1.ViewService", "GetTopology"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// Returns the wound that blades have made in the surface that frames show, in parts: what changes in the mesh of GetMesh.
+        pub async fn get_wound(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetWoundRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::GetWoundResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ViewService/GetWound",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ViewService", "GetWound"));
+            self.inner.server_streaming(req, path, codec).await
+        }
         /// Returns the image of the tissue's surface, in parts.
         pub async fn get_texture(
             &mut self,
@@ -6941,6 +7077,17 @@ pub mod view_service_server {
             tonic::Response<Self::GetTopologyStream>,
             tonic::Status,
         >;
+        /// Server streaming response type for the GetWound method.
+        type GetWoundStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::GetWoundResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns the wound that blades have made in the surface that frames show, in parts: what changes in the mesh of GetMesh.
+        async fn get_wound(
+            &self,
+            request: tonic::Request<super::GetWoundRequest>,
+        ) -> std::result::Result<tonic::Response<Self::GetWoundStream>, tonic::Status>;
         /// Server streaming response type for the GetTexture method.
         type GetTextureStream: tonic::codegen::tokio_stream::Stream<
                 Item = std::result::Result<super::GetTextureResponse, tonic::Status>,
@@ -7129,6 +7276,52 @@ pub mod view_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetTopologySvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ViewService/GetWound" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetWoundSvc<T: ViewService>(pub Arc<T>);
+                    impl<
+                        T: ViewService,
+                    > tonic::server::ServerStreamingService<super::GetWoundRequest>
+                    for GetWoundSvc<T> {
+                        type Response = super::GetWoundResponse;
+                        type ResponseStream = T::GetWoundStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetWoundRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ViewService>::get_wound(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetWoundSvc(inner);
                         let codec = crate::codec::BoundedCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

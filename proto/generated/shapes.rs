@@ -890,6 +890,34 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 4, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
+Shape { name: "palpate.v1.GetWoundRequest", bytes: size_of::<crate::pb::GetWoundRequest>(), decode: |bytes| <crate::pb::GetWoundRequest as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Text },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
+] },
+Shape { name: "palpate.v1.GetWoundResponse", bytes: size_of::<crate::pb::GetWoundResponse>(), decode: |bytes| <crate::pb::GetWoundResponse as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(143) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(144) },
+Field { number: 6, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 7, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
+] },
+Shape { name: "palpate.v1.LipVertex", bytes: size_of::<crate::pb::LipVertex>(), decode: |bytes| <crate::pb::LipVertex as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 4, is_list: false, kind: FieldKind::Number(4, 4) },
+Field { number: 5, is_list: false, kind: FieldKind::Number(4, 4) },
+] },
+Shape { name: "palpate.v1.CutTriangles", bytes: size_of::<crate::pb::CutTriangles>(), decode: |bytes| <crate::pb::CutTriangles as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 3, is_list: true, kind: FieldKind::Number(4, 0) },
+] },
 Shape { name: "palpate.v1.GetTextureRequest", bytes: size_of::<crate::pb::GetTextureRequest>(), decode: |bytes| <crate::pb::GetTextureRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
@@ -922,7 +950,7 @@ Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 13, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 15, is_list: true, kind: FieldKind::Message(145) },
+Field { number: 15, is_list: true, kind: FieldKind::Message(149) },
 Field { number: 16, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 17, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
@@ -942,7 +970,7 @@ Shape { name: "palpate.v1.AcknowledgeFramesResponse", bytes: size_of::<crate::pb
 Shape { name: "palpate.v1.ListNodesRequest", bytes: size_of::<crate::pb::ListNodesRequest>(), decode: |bytes| <crate::pb::ListNodesRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListNodesResponse", bytes: size_of::<crate::pb::ListNodesResponse>(), decode: |bytes| <crate::pb::ListNodesResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(150) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(154) },
 ] },
 Shape { name: "palpate.v1.Node", bytes: size_of::<crate::pb::Node>(), decode: |bytes| <crate::pb::Node as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -957,7 +985,7 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListFleetSessionsRequest", bytes: size_of::<crate::pb::ListFleetSessionsRequest>(), decode: |bytes| <crate::pb::ListFleetSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListFleetSessionsResponse", bytes: size_of::<crate::pb::ListFleetSessionsResponse>(), decode: |bytes| <crate::pb::ListFleetSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(153) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(157) },
 ] },
 Shape { name: "palpate.v1.FleetSession", bytes: size_of::<crate::pb::FleetSession>(), decode: |bytes| <crate::pb::FleetSession as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -984,7 +1012,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.ListCallersRequest", bytes: size_of::<crate::pb::ListCallersRequest>(), decode: |bytes| <crate::pb::ListCallersRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListCallersResponse", bytes: size_of::<crate::pb::ListCallersResponse>(), decode: |bytes| <crate::pb::ListCallersResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(160) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(164) },
 ] },
 Shape { name: "palpate.v1.CallerUse", bytes: size_of::<crate::pb::CallerUse>(), decode: |bytes| <crate::pb::CallerUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -998,7 +1026,7 @@ Shape { name: "palpate.v1.ListStreamsRequest", bytes: size_of::<crate::pb::ListS
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.ListStreamsResponse", bytes: size_of::<crate::pb::ListStreamsResponse>(), decode: |bytes| <crate::pb::ListStreamsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(163) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(167) },
 ] },
 Shape { name: "palpate.v1.StreamUse", bytes: size_of::<crate::pb::StreamUse>(), decode: |bytes| <crate::pb::StreamUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
@@ -1043,15 +1071,15 @@ Shape { name: "palpate.v1.CreateHereResponse", bytes: size_of::<crate::pb::Creat
 Field { number: 1, is_list: false, kind: FieldKind::Message(93) },
 ] },
 Shape { name: "palpate.v1.MirrorRequest", bytes: size_of::<crate::pb::MirrorRequest>(), decode: |bytes| <crate::pb::MirrorRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(175) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(176) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(178) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(179) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(180) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(182) },
 ] },
 Shape { name: "palpate.v1.MirrorOpen", bytes: size_of::<crate::pb::MirrorOpen>(), decode: |bytes| <crate::pb::MirrorOpen as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorParts", bytes: size_of::<crate::pb::MirrorParts>(), decode: |bytes| <crate::pb::MirrorParts as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(177) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(181) },
 ] },
 Shape { name: "palpate.v1.MirrorPart", bytes: size_of::<crate::pb::MirrorPart>(), decode: |bytes| <crate::pb::MirrorPart as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1063,7 +1091,7 @@ Shape { name: "palpate.v1.MirrorEnd", bytes: size_of::<crate::pb::MirrorEnd>(), 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorResponse", bytes: size_of::<crate::pb::MirrorResponse>(), decode: |bytes| <crate::pb::MirrorResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(180) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(184) },
 ] },
 Shape { name: "palpate.v1.Mirrored", bytes: size_of::<crate::pb::Mirrored>(), decode: |bytes| <crate::pb::Mirrored as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1072,13 +1100,13 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.TakeSessionRequest", bytes: size_of::<crate::pb::TakeSessionRequest>(), decode: |bytes| <crate::pb::TakeSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(182) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(186) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.TakeOver", bytes: size_of::<crate::pb::TakeOver>(), decode: |bytes| <crate::pb::TakeOver as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(184) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(183) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(188) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(187) },
 ] },
 Shape { name: "palpate.v1.KnownLaw", bytes: size_of::<crate::pb::KnownLaw>(), decode: |bytes| <crate::pb::KnownLaw as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1099,17 +1127,17 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(187) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(191) },
 ] },
 Shape { name: "palpate.journal.v1.Input", bytes: size_of::<crate::journal::Input>(), decode: |bytes| <crate::journal::Input as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(188) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(194) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(195) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(196) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(197) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(198) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(199) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(192) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(198) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(199) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(201) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(202) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(203) },
 ] },
 Shape { name: "palpate.journal.v1.Command", bytes: size_of::<crate::journal::Command>(), decode: |bytes| <crate::journal::Command as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1121,10 +1149,10 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(189) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(190) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(191) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(193) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(193) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(194) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(195) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(197) },
 ] },
 Shape { name: "palpate.journal.v1.Push", bytes: size_of::<crate::journal::Push>(), decode: |bytes| <crate::journal::Push as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1140,7 +1168,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
 Shape { name: "palpate.journal.v1.Pose", bytes: size_of::<crate::journal::Pose>(), decode: |bytes| <crate::journal::Pose as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(192) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(196) },
 ] },
 Shape { name: "palpate.journal.v1.Tip", bytes: size_of::<crate::journal::Tip>(), decode: |bytes| <crate::journal::Tip as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1190,23 +1218,23 @@ Shape { name: "palpate.journal.v1.Snapshot", bytes: size_of::<crate::journal::Sn
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(194) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(198) },
 Field { number: 5, is_list: false, kind: FieldKind::Text },
 Field { number: 6, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Felt", bytes: size_of::<crate::journal::Felt>(), decode: |bytes| <crate::journal::Felt as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(203) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(207) },
 ] },
 Shape { name: "palpate.journal.v1.Moment", bytes: size_of::<crate::journal::Moment>(), decode: |bytes| <crate::journal::Moment as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(204) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(208) },
 ] },
 Shape { name: "palpate.journal.v1.FeltTool", bytes: size_of::<crate::journal::FeltTool>(), decode: |bytes| <crate::journal::FeltTool as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(205) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(205) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(205) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(209) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(209) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(209) },
 ] },
 Shape { name: "palpate.journal.v1.Vector", bytes: size_of::<crate::journal::Vector>(), decode: |bytes| <crate::journal::Vector as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 4) },
@@ -1214,7 +1242,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 ] },
 Shape { name: "palpate.journal.v1.Waiting", bytes: size_of::<crate::journal::Waiting>(), decode: |bytes| <crate::journal::Waiting as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(187) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(191) },
 ] },
 Shape { name: "palpate.journal.v1.Signature", bytes: size_of::<crate::journal::Signature>(), decode: |bytes| <crate::journal::Signature as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1236,17 +1264,17 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(64) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(210) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(213) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(194) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(214) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(217) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(198) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal::TriangleMesh>(), decode: |bytes| <crate::journal::TriangleMesh as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(212) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(211) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(216) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(215) },
 ] },
 Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1292,7 +1320,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(216) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(220) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1308,8 +1336,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(216) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(220) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1320,7 +1348,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1329,20 +1357,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(219) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(221) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(223) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(223) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(225) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(227) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(220) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(222) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(224) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(224) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(226) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(228) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1354,20 +1382,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(227) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(225) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(225) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(231) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(229) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(229) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(226) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(230) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(232) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(235) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(236) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1382,14 +1410,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(217) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(221) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1398,7 +1426,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1408,7 +1436,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1416,7 +1444,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1427,7 +1455,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1435,7 +1463,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

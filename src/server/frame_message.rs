@@ -12,7 +12,7 @@ const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
 
 /// Returns the messages of a frame for the viewer `viewer_id`, in the order of the frame's patches; only the last one
 /// has `last` set. Each has patches of at most 64 KiB together, or a single larger one. `skipped` is the number of
-/// frames before this one that the viewer did not get. Empty for a frame without patches.
+/// frames before this one that the viewer did not get. A frame without patches tells of a new topology alone.
 pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::WatchFramesResponse> {
     let frame = &delivery.frame;
     let [vertices_x, vertices_y] = frame.refinement.vertices();
@@ -47,6 +47,9 @@ pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec
         if let Some(message) = messages.last_mut() {
             message.patches.push(self::patch(patch));
         }
+    }
+    if messages.is_empty() {
+        messages.push(message());
     }
     if let Some(last) = messages.last_mut() {
         last.last = true;

@@ -123,6 +123,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.ViewService/GetMesh", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetTexture", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetTopology", Access::Role(Role::Watch)),
+    ("/palpate.v1.ViewService/GetWound", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/WatchFrames", Access::Role(Role::Watch)),
 ];
 

@@ -51,6 +51,7 @@ mod transport;
 mod uploads;
 mod validity;
 mod views;
+mod wound_parts;
 
 pub use cluster_config::{ClusterConfig, Durable};
 pub use journals::Keep;

@@ -16,6 +16,7 @@ use super::mesh_parts::mesh_part;
 use super::services::Services;
 use super::stream_termination::until_cut;
 use super::topology_parts::TopologyParts;
+use super::wound_parts::WoundParts;
 use palpate_realtime::frames::Viewer;
 use palpate_realtime::ids::random_id;
 use palpate_realtime::{FrameReader, StreamGuard, StreamKind};
@@ -69,6 +70,7 @@ impl ViewStream {
 impl ViewService for Views {
     type GetMeshStream = ViewMessages<pb::GetMeshResponse>;
     type GetTopologyStream = ViewMessages<pb::GetTopologyResponse>;
+    type GetWoundStream = ViewMessages<pb::GetWoundResponse>;
     type GetTextureStream = ViewMessages<pb::GetTextureResponse>;
     type WatchFramesStream = ViewMessages<pb::WatchFramesResponse>;
 
@@ -96,6 +98,23 @@ impl ViewService for Views {
         let guard = handle.open_stream("GetTopology", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let begin = Some((TopologyParts::new(&handle, since_version), guard));
+        let out = stream::unfold(begin, |rest| async move {
+            let (mut parts, guard) = rest?;
+            let message = parts.next();
+            let last = message.last;
+            Some((Ok(message), (!last).then_some((parts, guard))))
+        });
+        Ok(Response::new(until_cut(out, cut)))
+    }
+
+    async fn get_wound(&self, request: Request<pb::GetWoundRequest>) -> Result<Response<Self::GetWoundStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let pb::GetWoundRequest { session_id, refinement, since_version } = request.into_inner();
+        let handle = self.0.session(&session_id).await?;
+        let grid = Refinement::new(&handle.model.scene, refinement, &self.0.config.limits)?;
+        let guard = handle.open_stream("GetWound", StreamKind::ReadsOnly, &account)?;
+        let cut = guard.cut().clone();
+        let begin = Some((WoundParts::new(&handle, grid, since_version), guard));
         let out = stream::unfold(begin, |rest| async move {
             let (mut parts, guard) = rest?;
             let message = parts.next();

@@ -7,6 +7,8 @@ import type { Failure, Server } from "./server.js";
 export interface FrameTold {
   step: bigint;
   timeS: number;
+  /** The version of what joins the points: if it is not that of a `Wound`, call `followWound`. */
+  topologyVersion: number;
 }
 
 export class Frames {
@@ -41,7 +43,7 @@ export class Frames {
       this.taken += data.taken;
       this.skipped = before + data.skipped;
       this.server.received.bytes += data.bytes;
-      this.newest = { step: data.step, timeS: data.timeS };
+      this.newest = { step: data.step, timeS: data.timeS, topologyVersion: data.topologyVersion };
       this.onFrame(this.newest);
     };
     worker.onerror = (event) => onFailure({ isGone: false, reason: "", text: event.message || "can't receive frames" }, 0);

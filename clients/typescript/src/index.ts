@@ -1,5 +1,5 @@
 // See and touch tissue from a browser. `Server` provides the calls of the protocol (palpate/v1); `fetchMesh` and
-// `Frames` provide the surface, `watchSamples` what the tools feel, a `Tool` touches, and an `InstrumentTool` leads an
+// `Frames` provide the surface, `followWound` what blades have cut, `watchSamples` what the tools feel, a `Tool` touches, and an `InstrumentTool` leads an
 // `Instrument`.
 
 export { Field, type Rectangle } from "./field.js";
@@ -10,6 +10,7 @@ export {
   Instrument,
   type InstrumentPose,
   type InstrumentTip,
+  knife,
   MAX_TIPS,
   type Row,
   type TipForces,
@@ -35,3 +36,4 @@ export {
 } from "./server.js";
 export { type Action, Tool, type Wanted } from "./tool.js";
 export { cross, dot, norm, plus, rotated, type Rotation, rotationTo, unit, vec, type Vec3 } from "./vector.js";
+export { type Cut, followWound, type Lip, mixed, Wound, type WoundChange } from "./wound.js";

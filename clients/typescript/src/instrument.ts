@@ -65,15 +65,17 @@ export class Instrument {
   /** Returns the place of a tip by its number. */
   tipM(number: number, { positionM, orientation, jawRad }: InstrumentPose): Vec3 {
     const { offsetM, part } = this.tips[number]!;
-    const half = (turnOf(part) * jawRad) / 2;
-    const turn = { w: Math.cos(half), x: 0, y: 0, z: Math.sin(half) };
-    const inFrameM = half === 0 ? offsetM : plus(this.hingeM, rotated(turn, plus(offsetM, this.hingeM, -1)));
+    const turn = jawTurn(part, { jawRad });
+    const inFrameM = turn.z === 0 ? offsetM : plus(this.hingeM, rotated(turn, plus(offsetM, this.hingeM, -1)));
     return plus(positionM, rotated(orientation, inFrameM));
   }
 
   /** Returns the target of each tip at a pose. */
   leads(pose: InstrumentPose): Lead[] {
-    return this.tips.map(({ tip }, number) => ({ ...tip, positionM: this.tipM(number, pose) }));
+    return this.tips.map(({ tip, part }, number) => {
+      const edgeM = tip.edgeM && rotated(pose.orientation, rotated(jawTurn(part, pose), tip.edgeM));
+      return { ...tip, ...(edgeM && { edgeM }), positionM: this.tipM(number, pose) };
+    });
   }
 
   /** Returns the sum of forces on the tips and of their torques. */
@@ -120,8 +122,21 @@ export function grasper(jaws: Row, shaft?: Row): Instrument {
   return instrument;
 }
 
+/** Returns a blade whose edge runs from its tip, at the origin, along −x. `radiusM` is how far around the edge the surface is felt. */
+export function knife(lengthM: number, radiusM = 0.001): Instrument {
+  const instrument = new Instrument();
+  instrument.tips.push({ offsetM: [0, 0, 0], tip: { radiusM, shape: TipShape.BLADE, edgeM: [-lengthM, 0, 0] }, part: InstrumentPart.BODY });
+  return instrument;
+}
+
 function tipOf({ radiusM, friction, shape, grasps }: Tip): Tip {
   return { radiusM, friction, shape, grasps };
+}
+
+/** Returns how a part is turned about the axis of the jaws. */
+function jawTurn(part: InstrumentPart, { jawRad }: Pick<InstrumentPose, "jawRad">): Rotation {
+  const half = (turnOf(part) * jawRad) / 2;
+  return { w: Math.cos(half), x: 0, y: 0, z: Math.sin(half) };
 }
 
 /** Returns how far a part turns about the hinge for each radian between the jaws. */

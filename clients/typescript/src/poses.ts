@@ -17,8 +17,10 @@ export interface Tip {
   radiusM: number;
   /** μ of Coulomb's friction; 0.2 if absent. */
   friction?: number;
-  /** A disc of even pressure if absent. Other tips touch solids alone. */
+  /** A disc of even pressure if absent. Rigid tips touch solids alone; a blade cuts sheets and surfaces. */
   shape?: TipShape;
+  /** The edge of a blade from the tip, which is the tool's place, to its heel, m: in the frame of the tissue, or of the instrument. */
+  edgeM?: Vec3;
   /** Whether it holds the tissue, and pulls as well as pushes; else it touches. Discs only. */
   grasps?: boolean;
 }
@@ -36,8 +38,9 @@ interface Posed {
 }
 
 /** Converts a pose to a message. */
-export function poseOf({ positionM: [x, y, z], radiusM, friction, shape, grasps }: Lead): MessageInitShape<typeof PoseSchema> {
-  return { positionM: { x, y, z }, tip: { radiusM, friction, shape, grasps } };
+export function poseOf({ positionM: [x, y, z], radiusM, friction, shape, grasps, edgeM }: Lead): MessageInitShape<typeof PoseSchema> {
+  const edge = edgeM && { x: edgeM[0], y: edgeM[1], z: edgeM[2] };
+  return { positionM: { x, y, z }, tip: { radiusM, friction, shape, grasps, edgeM: edge } };
 }
 
 /** The newest poses of a tool with a single tip. */
@@ -45,8 +48,9 @@ export class Poses {
   /** Newest first. */
   private recent: Posed[] = [];
   private readonly maxEarlier: number;
-  /** Whether those grasp: earlier poses have the same tip. */
+  /** Whether those grasp, and the edge of their blade: earlier poses have the same tip. */
   private grasps = false;
+  private edgeM = "";
 
   /** Sequence of the next pose. */
   private sequence: bigint;
@@ -69,7 +73,8 @@ export class Poses {
   /** Adds a pose at the client's time `timeNs`, which must increase. Returns the message. */
   message(lead: Lead, timeNs: bigint): MessageInitShape<typeof ToolPosesSchema> {
     const grasps = lead.grasps ?? false;
-    if (grasps !== this.grasps) [this.grasps, this.recent] = [grasps, []];
+    const edgeM = String(lead.edgeM);
+    if (grasps !== this.grasps || edgeM !== this.edgeM) [this.grasps, this.edgeM, this.recent] = [grasps, edgeM, []];
     const newest = { sequence: this.sequence, timeNs, positionM: lead.positionM };
     const earlier = this.recent.flatMap((before) => earlierPose(newest, before));
     this.recent = [newest, ...this.recent].slice(0, this.maxEarlier);

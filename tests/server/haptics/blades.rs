@@ -45,6 +45,21 @@ async fn topology(server: &TestServer, session_id: &str, since_version: u32) -> 
     whole
 }
 
+async fn wound(server: &TestServer, session_id: &str, refinement: u32, since_version: u32) -> pb::GetWoundResponse {
+    let request = pb::GetWoundRequest { session_id: session_id.to_owned(), refinement, since_version };
+    let mut parts = server.views().await.get_wound(request).await.unwrap().into_inner();
+    let mut whole = pb::GetWoundResponse::default();
+    while let Some(part) = parts.message().await.unwrap() {
+        assert!(!whole.last);
+        let (mut vertices, mut triangles) = (std::mem::take(&mut whole.vertices), std::mem::take(&mut whole.triangles));
+        vertices.extend(part.vertices.iter().copied());
+        triangles.extend(part.triangles.iter().cloned());
+        whole = pb::GetWoundResponse { vertices, triangles, ..part };
+    }
+    assert!(whole.last);
+    whole
+}
+
 /// Sends the commands of some steps and lets them pass.
 async fn lead(server: &TestServer, session: &str, touch: &mut TestTouch, steps: std::ops::Range<u64>) {
     for step in steps.clone() {
@@ -93,6 +108,48 @@ async fn a_session_tells_what_a_blade_has_severed_and_a_snapshot_in_mid_cut_cont
     }
     let bytes = prost::Message::encoded_len(&all);
     assert!(bytes < 100 * all.severed.len(), "{bytes} bytes for {} springs", all.severed.len());
+}
+
+#[tokio::test]
+async fn a_wound_is_sent_to_a_viewer_that_follows_and_whole_to_a_late_one() {
+    let server = TestServer::start(&[]);
+    let session = create(&server, pb::create_session_request::Source::SceneName("liver".into())).await;
+    let with_knife =
+        |session: &str| pb::TouchOpen { instruments: vec![instrument::instrument(&knife(), 0)], ..open(session, &[0]) };
+    let mut touch = TestTouch::open(&server, with_knife(&session)).await.unwrap();
+    let request = pb::WatchFramesRequest { session_id: session.clone(), refinement: 3, ..Default::default() };
+    let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    let before = wound(&server, &session, 0, 0).await;
+    assert_eq!((before.version, before.pieces, before.severed), (0, 1, 0));
+    assert!(before.vertices.is_empty() && before.triangles.is_empty() && !before.stays_whole);
+    lead(&server, &session, &mut touch, 0..STEPS / 2).await;
+    let half = [wound(&server, &session, 0, 0).await, wound(&server, &session, 3, 0).await];
+    lead(&server, &session, &mut touch, STEPS / 2..STEPS).await;
+    for (known, (refinement, vertices)) in half.into_iter().zip([(0, 31 * 31), (3, 121 * 121)]) {
+        let all = wound(&server, &session, refinement, 0).await;
+        let later = wound(&server, &session, refinement, known.version).await;
+        assert!(later.continues && later.version == all.version && all.severed > known.severed, "{later:?}");
+        assert_eq!((all.first_vertex, later.first_vertex), (vertices, vertices + known.vertices.len() as u32));
+        let followed: Vec<_> = known.vertices.iter().chain(&later.vertices).copied().collect();
+        assert_eq!(followed, all.vertices);
+        let mut triangles: std::collections::BTreeMap<u32, pb::CutTriangles> = std::collections::BTreeMap::new();
+        triangles.extend(known.triangles.into_iter().chain(later.triangles).map(|cut| (cut.first, cut)));
+        assert_eq!(triangles.into_values().collect::<Vec<_>>(), all.triangles);
+        // Both lips of each spring lie side by side, and ride on vertices on both sides of the blade.
+        let rows = |vertex: u32| vertex / (if refinement == 0 { 31 } else { 121 });
+        for lips in all.vertices.chunks(2) {
+            assert_eq!([lips[0].host, lips[0].second], [lips[1].second, lips[1].host]);
+            assert!(rows(lips[0].host) != rows(lips[1].host), "{lips:?}");
+        }
+        let bytes = prost::Message::encoded_len(&all);
+        assert!(bytes < 100 * all.severed as usize, "{bytes} bytes for {} springs", all.severed);
+    }
+    // Frames tell that there is more to ask for.
+    let version = wound(&server, &session, 0, 0).await.version;
+    while frames.message().await.unwrap().unwrap().topology_version < version {}
+    let mut views = server.views().await;
+    let refused = views.get_wound(pb::GetWoundRequest { session_id: session, refinement: 99, since_version: 0 });
+    assert!(refused.await.is_err());
 }
 
 #[tokio::test]

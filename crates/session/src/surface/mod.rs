@@ -9,12 +9,14 @@ pub mod refine;
 pub mod skin;
 pub mod tiles;
 mod wide;
+pub mod wound;
 
 pub use displacements::Snapshot;
 pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, MESH_ROW, Refinement};
 pub use skin::Skin;
 pub use tiles::FrameTiles;
+pub use wound::Wound;
 
 /// Returns a scene with this many points along x and y, 1 cm apart.
 #[cfg(test)]

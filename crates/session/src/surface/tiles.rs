@@ -41,6 +41,8 @@ pub struct FrameTiles {
     changed: bool,
     /// The newest snapshot. All tiles show it within a quantum.
     now: Arc<Snapshot>,
+    /// The update since which the topology has its version.
+    joined_since: u64,
     box_m: [[f32; 2]; COMPONENTS],
     quanta: Quanta,
     tiles: Vec<Tile>,
@@ -134,6 +136,7 @@ impl FrameTiles {
             key: snapshot.clone(),
             changed: false,
             now: snapshot.clone(),
+            joined_since: 0,
             box_m: *snapshot.box_m(),
             quanta: Quanta::default(),
             tiles: (0..along_x * along_y).map(tile).collect(),
@@ -176,7 +179,7 @@ impl FrameTiles {
             return self.write_all(snapshot);
         }
         self.version += 1;
-        self.now = snapshot.clone();
+        self.take_moment(snapshot);
         for (whole, now) in self.box_m.iter_mut().zip(snapshot.box_m()) {
             *whole = [whole[0].min(now[0]), whole[1].max(now[1])];
         }
@@ -197,7 +200,7 @@ impl FrameTiles {
     fn write_all(&mut self, snapshot: &Arc<Snapshot>) {
         self.version += 1;
         self.key = snapshot.clone();
-        self.now = snapshot.clone();
+        self.take_moment(snapshot);
         self.changed = false;
         self.box_m = *snapshot.box_m();
         self.fit();
@@ -207,14 +210,22 @@ impl FrameTiles {
         }
     }
 
+    /// Makes `snapshot` the newest one.
+    fn take_moment(&mut self, snapshot: &Arc<Snapshot>) {
+        if snapshot.topology_version != self.now.topology_version {
+            self.joined_since = self.version;
+        }
+        self.now = snapshot.clone();
+    }
+
     fn fit(&mut self) {
         self.quanta = Quanta::over(self.encoding, &self.box_m, self.finest_m);
     }
 
-    /// Returns whether any tile was written after version `version`. `None` stands for a viewer without a frame: then
-    /// it is true.
+    /// Returns whether any tile was written after version `version`, or the topology has changed since. `None` stands for a viewer
+    /// without a frame: then it is true.
     pub fn is_newer_than(&self, version: Option<u64>) -> bool {
-        self.tiles.iter().any(|tile| Some(tile.version) > version)
+        Some(self.joined_since) > version || self.tiles.iter().any(|tile| Some(tile.version) > version)
     }
 
     /// Returns a frame of the newest snapshot with the tiles that were written after version `version`; all of them
