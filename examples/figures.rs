@@ -138,6 +138,22 @@ fn pressed(organ_pressed: &Pressed) {
     }
 }
 
+/// The slab `liver`, cut by the script `cut`, without and with a pretension that opens the wound.
+fn wounds() {
+    let (_, text) = BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap();
+    for (name, pretension_n_per_m) in [("closed", 0.0), ("open", 2.0)] {
+        let sets = [format!("springs.pretension_n_per_m={pretension_n_per_m:?}")];
+        let limits = Limits::default();
+        let model = Model::compile(&Scene::parse("liver", text, &sets, &limits).unwrap(), &limits).unwrap();
+        let refinement = Refinement::new(&model.scene, Refinement::for_picture(&model.scene), &limits).unwrap();
+        let skin = texture::image(&model.scene.appearance, &limits).unwrap();
+        let view = View { camera: from(25.0, 55.0, 1.0), size: SIZE, refinement, texture: Some(skin) };
+        let script = script("cut", &model);
+        let still = Film::new(&model, &script, &limits).unwrap().at(1850).unwrap();
+        write(&format!("wound-{name}.png"), &still.picture(&model, &view).png().unwrap());
+    }
+}
+
 /// Force over depth of a slow press of `liver-organ`, over its lumps and away from them.
 fn lumps() {
     let model = organ("liver-organ");
@@ -175,6 +191,7 @@ fn main() {
 
     ORGANS.iter().for_each(pressed);
     lumps();
+    wounds();
 
     let sweep = |file: &str, panels: &[Panel]| write(file, svg(panels.len(), panels).as_bytes());
     let one = |title, what, values: &[f64], up| [curves(title, what, values, up, &[])];

@@ -191,6 +191,31 @@ fn the_image_lies_on_the_sheet_as_it_should() {
 }
 
 #[test]
+fn a_wound_is_open_between_two_lips_and_nothing_else_changes() {
+    let view = ["--camera", "0,90", "--size", "400x300", "--set", "appearance.texture_size=64"];
+    let gapes = ["--set", "springs.pretension_n_per_m=2.0", "--set", "cutting.toughness_j_per_m2=0.0"];
+    let of = |more: &[&str]| decoded(&made("a.png", &[&["render", "liver", "cut"], &view[..], &gapes, more].concat()));
+    // Before the blade is in the tissue, and after it has left.
+    for more in [&[][..], &["--refine", "0"], &["--wireframe"]] {
+        let [whole, cut] = ["0", "1.85"].map(|at_s| of(&[&["--at-s", at_s], more].concat()));
+        let darker = |x: usize, y: usize| {
+            let light = |image: &Image| pixel(image, x, y).into_iter().map(u32::from).sum::<u32>();
+            light(&cut) * 4 < light(&whole) * 3
+        };
+        // The cut is 30 mm of 75 mm long, along y in the middle.
+        let rows: Vec<Vec<usize>> = (0..300).map(|y| (0..400).filter(|x| darker(*x, y)).collect()).collect();
+        let open: Vec<usize> = (0..300).filter(|y| !rows[*y].is_empty()).collect();
+        assert!((60..140).contains(&open.len()), "{more:?}: {open:?}");
+        let (first, last) = (open[0], open[open.len() - 1]);
+        assert!(last - first < open.len() + 6, "{more:?}: {open:?}");
+        let columns: Vec<usize> = rows.iter().flatten().copied().collect();
+        let (left, right) = (columns.iter().min().unwrap(), columns.iter().max().unwrap());
+        // A few pixels wide: it is not a stretched row of cells, each of 6 pixels.
+        assert!((1..16).contains(&(right - left)), "{more:?}: columns {left} to {right}");
+    }
+}
+
+#[test]
 fn a_dent_shows_where_the_force_is() {
     let view = ["--camera", "0,90", "--size", "96x72", "--set", "appearance.texture_size=64"];
     let of = |more: &[&str]| decoded(&made("a.png", &[&["render", "paper", "vertical-60"], &view[..], more].concat()));

@@ -6,12 +6,12 @@ use std::sync::Arc;
 use super::picture::{Arrow, View, picture};
 use palpate_session::Session;
 use palpate_session::simulation::{Simulation, SimulationFailure};
-use palpate_session::surface::{Skin, Snapshot};
+use palpate_session::surface::{Skin, Snapshot, Wound};
 use palpate_texture::Image;
-use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::{Cuts, Model};
 
 /// A script that is played on a session of its own, step by step and only forwards, to make pictures of it.
 pub struct Film<'a> {
@@ -23,6 +23,7 @@ pub struct Film<'a> {
 /// The tissue at one moment, and the forces that act on it: all that a picture needs besides the model and the view.
 pub struct Still {
     snapshot: Snapshot,
+    cuts: Cuts,
     shown: Option<Arc<Skin>>,
     arrows: Vec<Arrow>,
 }
@@ -87,7 +88,7 @@ impl Still {
         session.tissue().shown_displacements_m(&mut displacement_m);
         let snapshot = Snapshot::new(&session.model().scene, session.step_count(), session.time_s(), displacement_m)
             .with_skin(shown);
-        Still { snapshot, shown: shown.cloned(), arrows }
+        Still { snapshot, cuts: session.tissue().cuts(), shown: shown.cloned(), arrows }
     }
 
     /// Returns the simulated time, s.
@@ -97,7 +98,9 @@ impl Still {
 
     /// Draws the tissue as seen by `view`, as [`picture`] does. `model` must be that of the session.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
-        picture(model.shape(), self.shown.as_deref(), &self.snapshot, &self.arrows, view)
+        let shown = self.shown.as_deref();
+        let wound = Wound::of(model, &self.cuts, shown, view.refinement);
+        picture(model.shape(), shown, &self.snapshot, wound.as_ref(), &self.arrows, view)
     }
 }
 

@@ -5,6 +5,7 @@ mod canvas;
 mod film;
 mod picture;
 mod surface;
+mod wound;
 
 pub use film::{Film, Gif, Still, gif};
 pub use picture::{Arrow, Camera, LARGEST_SIDE, View, picture};

@@ -5,7 +5,7 @@ use glam::{DVec2, DVec3, Vec3Swizzles};
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use super::surface::{DrawnSurface, Vertex};
 use palpate_refusal::{Reason, Refusal, Result, number};
-use palpate_session::surface::{Refinement, Skin as Shown, Snapshot};
+use palpate_session::surface::{Refinement, Skin as Shown, Snapshot, Wound};
 use palpate_texture::Image;
 use palpate_tissue::shape::{PointId, PointName, RestShape};
 
@@ -88,6 +88,13 @@ const HALF_VIEW: f64 = 0.30;
 /// Length of an arrow, as a fraction of the tissue's longest side.
 const ARROW: f64 = 0.16;
 
+/// The tissue within a wound, and the edge of a lip, as a picture with texture and one of lines have them.
+const WOUND: [[u8; 3]; 2] = [[96, 12, 14], [58, 8, 10]];
+const PALE_WOUND: [[u8; 3]; 2] = [[176, 96, 92], [96, 36, 34]];
+
+/// Width of the line along a lip, as a fraction of the picture's width.
+const LIP: f64 = 0.0016;
+
 /// The eye and its projection to the picture.
 struct Eye {
     at_m: DVec3,
@@ -126,16 +133,17 @@ impl Eye {
 }
 
 /// Draws the tissue of rest shape `shape` in the state of `snapshot`, with `arrows`, as seen by `view`. `shown` is
-/// the surface that frames show of a mesh; `None` for a sheet. Returns an image of [`View::size`], equal on any
+/// the surface that frames show of a mesh; `None` for a sheet. `wound` is that of the surface, at the view's refinement. Returns an image of [`View::size`], equal on any
 /// machine. Parts nearer to the eye than a hundredth of the tissue's longest side are left out.
 pub fn picture(
     shape: &dyn RestShape,
     shown: Option<&Shown>,
     snapshot: &Snapshot,
+    wound: Option<&Wound>,
     arrows: &[Arrow],
     view: &View,
 ) -> Image {
-    let surface = DrawnSurface::new(shape, shown, snapshot, view.refinement);
+    let surface = DrawnSurface::new(shape, shown, snapshot, wound, view.refinement);
     let eye = Eye::new(shape, view);
     let nearest_m = 0.01 * shape.longest_side_m();
     let background = if view.texture.is_some() { [20, 14, 13] } else { [255, 255, 255] };
@@ -160,6 +168,18 @@ pub fn picture(
             if let [Some(from), Some(to)] = line.map(|index| corners[index]) {
                 canvas.line(from, to, width, 2e-3, ink);
             }
+        }
+    }
+    let [inside, lip] = if skin.is_some() { WOUND } else { PALE_WOUND }.map(colour);
+    for corners in &surface.wound.bed_m {
+        let corners = corners.map(|corner_m| eye.project(corner_m, nearest_m));
+        if let [Some(p), Some(q), Some(r)] = corners {
+            canvas.triangle([p, q, r], |_| inside);
+        }
+    }
+    for side in &surface.wound.lips {
+        if let [Some(from), Some(to)] = side.map(|index| corners[index]) {
+            canvas.line(from, to, LIP * view.size[0] as f64, 2e-3, lip);
         }
     }
     for arrow in arrows {

@@ -2,7 +2,8 @@
 
 use glam::{DVec2, DVec3};
 
-use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, encode};
+use super::wound::{DrawnWound, open_wound};
+use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, Wound, encode};
 use palpate_tissue::shape::RestShape;
 
 /// Factor over the median of texture per length above which a triangle is taken to cross a seam of the texture.
@@ -33,18 +34,31 @@ pub(super) struct DrawnSurface {
     pub(super) lines: Vec<[usize; 2]>,
     /// Approximate number of vertices along a side.
     pub(super) along: usize,
+    pub(super) wound: DrawnWound,
 }
 
 impl DrawnSurface {
-    /// Computes the surface from the frame that a viewer would get of `snapshot`.
-    pub(super) fn new(shape: &dyn RestShape, skin: Option<&Skin>, snapshot: &Snapshot, refinement: Refinement) -> Self {
+    /// Computes the surface from the frame that a viewer would get of `snapshot`, and opens its wound.
+    pub(super) fn new(
+        shape: &dyn RestShape,
+        skin: Option<&Skin>,
+        snapshot: &Snapshot,
+        wound: Option<&Wound>,
+        refinement: Refinement,
+    ) -> Self {
         match skin {
-            None => Self::of_grid(snapshot, refinement),
-            Some(skin) => Self::of_skin(shape, skin, snapshot, refinement),
+            None => Self::of_grid(shape, snapshot, wound, refinement),
+            Some(skin) => Self::of_skin(shape, skin, snapshot, wound, refinement),
         }
     }
 
-    fn of_skin(shape: &dyn RestShape, skin: &Skin, snapshot: &Snapshot, refinement: Refinement) -> Self {
+    fn of_skin(
+        shape: &dyn RestShape,
+        skin: &Skin,
+        snapshot: &Snapshot,
+        wound: Option<&Wound>,
+        refinement: Refinement,
+    ) -> Self {
         let moved_m = displacements(snapshot, refinement);
         let (least_m, longest_m) = (shape.extent().least_m, shape.longest_side_m());
         let rest_m: Vec<DVec3> = skin.vertices().iter().map(|vertex| skin.rest_m(*vertex)).collect();
@@ -79,8 +93,16 @@ impl DrawnSurface {
         lines.sort_unstable();
         lines.dedup();
         let along = (longest_m / skin.edge_m()).ceil() as usize;
-        let mut surface = DrawnSurface { vertices: (0..places_m.len()).map(vertex).collect(), triangles, lines, along };
-        surface.part_at_seams(|place| at_rest[place].abs());
+        let vertices = (0..places_m.len()).map(vertex).collect();
+        let mut surface = DrawnSurface { vertices, triangles, lines, along, wound: DrawnWound::default() };
+        if let Some(wound) = wound {
+            open_wound(&mut surface, wound, |place| rest_m[place], shape.edge_m());
+        }
+        let facing = |place: usize| match wound.and_then(|wound| wound.vertices.get(place.checked_sub(rest_m.len())?)) {
+            Some(lip) => at_rest[lip.host as usize].abs(),
+            None => at_rest[place].abs(),
+        };
+        surface.part_at_seams(facing);
         surface
     }
 
@@ -109,7 +131,7 @@ impl DrawnSurface {
         }
     }
 
-    fn of_grid(snapshot: &Snapshot, refinement: Refinement) -> Self {
+    fn of_grid(shape: &dyn RestShape, snapshot: &Snapshot, wound: Option<&Wound>, refinement: Refinement) -> Self {
         let points = refinement.coarsest();
         // Normals are interpolated between the points, so that shading is smooth: a bilinear patch has creases of its
         // own.
@@ -132,14 +154,19 @@ impl DrawnSurface {
         let [nx, ny] = count;
         let beyond =
             |index: usize| [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)];
-        DrawnSurface {
+        let mut surface = DrawnSurface {
             vertices,
             triangles: (0..refinement.cell_count()).flat_map(|cell| halves(refinement.triangles(cell))).collect(),
             lines: (0..nx * ny)
                 .flat_map(|index| beyond(index).into_iter().flatten().map(move |other| [index, other]))
                 .collect(),
             along: nx.max(ny),
+            wound: DrawnWound::default(),
+        };
+        if let Some(wound) = wound {
+            open_wound(&mut surface, wound, |vertex| refinement.rest_m(vertex), shape.edge_m());
         }
+        surface
     }
 }
 
