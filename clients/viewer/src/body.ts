@@ -8,6 +8,7 @@ import { Looks, type AmbientOcclusion } from "./ambient-occlusion";
 import { edgesOf, type Lists, lists, opening, touching } from "./topology";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
+import { ShownWound, type WoundedSurface } from "./wound";
 
 /** Number of vertices in a block, as a power of 2. */
 const BLOCK = 8;
@@ -41,11 +42,12 @@ function isSeamless({ uv, restM, triangles }: MeshData): boolean {
   return usual > 0 && largest < SEAM.times * usual;
 }
 
-export class Body implements Surface {
+export class Body implements Surface, WoundedSurface {
   readonly field: Field;
   readonly geometry = new BufferGeometry();
   readonly lines = new BufferGeometry();
   readonly edge = undefined;
+  readonly wound = new ShownWound(this);
   readonly box = new Box3();
   readonly sizeM: number;
   readonly every = 1;
@@ -134,6 +136,49 @@ export class Body implements Surface {
     return false;
   }
 
+  get vertexCount(): number {
+    return this.count;
+  }
+
+  get triangleCount(): number {
+    return this.triangles.length / 3;
+  }
+
+  get pointsApartM(): number {
+    return this.data.edgeM;
+  }
+
+  drawnVertex(vertex: number): number {
+    return vertex;
+  }
+
+  restOf(vertex: number, c: number): number {
+    return this.rest[3 * vertex + c]!;
+  }
+
+  hide(first: number, count: number): void {
+    // Rays still meet what was there.
+    let index = this.geometry.index!;
+    if (index.array === this.triangles) {
+      this.release();
+      this.geometry.setIndex((index = new BufferAttribute(this.triangles.slice(), 1).setUsage(DynamicDrawUsage)));
+    }
+    (index.array as Uint32Array).fill(0, 3 * first, 3 * (first + count));
+    index.addUpdateRange(3 * first, 3 * count);
+    index.needsUpdate = true;
+  }
+
+  showAll(): void {
+    this.release();
+    this.geometry.setIndex(new BufferAttribute(this.triangles, 1));
+  }
+
+  /** Frees the buffers on the graphics processor, which both geometries share, before one of them gets another. */
+  private release(): void {
+    this.geometry.dispose();
+    this.lines.dispose();
+  }
+
   /** Computes the light from each direction, with pauses so that the page stays responsive. */
   private findLight(): void {
     const looks = new Looks(this.rest, this.restNormal, this.triangles);
@@ -155,6 +200,11 @@ export class Body implements Surface {
   }
 
   refresh(): boolean {
+    return this.wound.refresh(this.move());
+  }
+
+  /** Moves the vertices to where the newest frame has them. Returns whether any moved. */
+  private move(): boolean {
     const changed = this.field.takeChanged();
     if (!changed) return false;
     const { rest, position, count } = this;
@@ -554,5 +604,6 @@ export class Body implements Surface {
     clearTimeout(this.lighting);
     this.geometry.dispose();
     this.lines.dispose();
+    this.wound.dispose();
   }
 }

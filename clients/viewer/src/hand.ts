@@ -2,16 +2,22 @@
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
 // stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and moves it with
-// the drag. A tip is held at a depth, and glides. A grasper (grasper.ts) has several tools. A place has a side on which
+// the drag. A tip is held at a depth, and glides. A blade stands upright at a depth, and cuts along the drag. A grasper (grasper.ts) has several tools. A place has a side on which
 // it is touched, and pushes go into the tissue from there. A parked tool stays where it is, as a held instrument does.
 
 import { type Action, type Lead, plus, Tool, type Vec3, type Wanted } from "palpate";
-import { type Sample, type TipShape } from "palpate/v1";
+import { type Sample, TipShape } from "palpate/v1";
+import type { ShownBlade } from "./blade-mark";
 import { Grasper, type View } from "./grasper";
 import { server } from "./server";
 import type { Place, Surface } from "./surface";
 
-export type Mode = "push" | "pull" | "stroke" | "tip" | "grasper";
+export type Mode = "push" | "pull" | "stroke" | "tip" | "blade" | "grasper";
+
+/** Length of a blade's edge, in depths of the deepest cut: it reaches out of the tissue, also of one that gives way. */
+const EDGE = 2;
+/** How far around its edge a blade feels the surface, in falloff lengths. */
+const BLADE = 0.3;
 
 /** A tip moves down from beside the tissue in this time, so that the server knows from which side it comes. */
 const SINK_MS = 250;
@@ -51,6 +57,7 @@ export class Hand {
   /** Time from which the tip moves down; undefined while the server does not act on this touch. */
   private sinksFromMs: number | undefined;
   private isLeft = false;
+  private bladeLead: Lead | undefined;
 
   /** The hand has the tool `firstTool` of the session, and a grasper those after it, too. */
   constructor(
@@ -132,7 +139,7 @@ export class Hand {
    * direction.
    */
   get outward(): Vec3 | undefined {
-    return this.mode === "tip" || this.mode === "grasper" ? undefined : this.place?.outward;
+    return this.isPosed ? undefined : this.place?.outward;
   }
 
   /** Whether it touches the outer side of the tissue. It stays on its side wherever it slips. */
@@ -140,7 +147,19 @@ export class Hand {
     return this.place && this.surface().isOuter(this.place);
   }
 
-  /** Depth of a tip or of open jaws, which are thinner, m. */
+  /** Its blade as drawn; undefined while that does not touch. */
+  get blade(): ShownBlade | undefined {
+    const { edgeM, positionM } = this.bladeLead ?? {};
+    if (this.mode !== "blade" || !this.touches || !edgeM || !positionM) return undefined;
+    return { tool: this.tool.tool, tipM: positionM, edgeM };
+  }
+
+  /** Whether poses lead it: it is at a depth, and glides. */
+  get isPosed(): boolean {
+    return this.mode === "tip" || this.mode === "blade" || this.mode === "grasper";
+  }
+
+  /** Depth of a tip, a blade or of open jaws, which are thinner, m. */
   get depthM(): number {
     return (this.mode === "grasper" ? 0.5 : 1) * this.strength * this.reach.depthM;
   }
@@ -207,11 +226,11 @@ export class Hand {
   /** Returns what the tool should do: at the place of the press, or where it has moved to. */
   private wanted(pressed: Place, now: number): Wanted {
     const place = this.place ?? pressed;
-    if (this.mode === "tip" || this.mode === "grasper") {
+    if (this.isPosed) {
       this.sinksFromMs = this.tool.isActing ? (this.sinksFromMs ?? now) : undefined;
       const isMoving = this.sunk(now) < 1;
       const stays = this.isParked;
-      if (this.mode === "tip") return { leads: [this.tip(place, now)], isMoving, stays };
+      if (this.mode !== "grasper") return { leads: [this.tip(place, now)], isMoving, stays };
       const wanted = this.grasper.wanted(place, this.outM(now), !isMoving, this.leanM, now);
       return { ...wanted, isMoving: isMoving || wanted.isMoving, stays };
     }
@@ -223,11 +242,13 @@ export class Hand {
     return this.sinksFromMs === undefined ? 0 : Math.min(1, (now - this.sinksFromMs) / SINK_MS);
   }
 
-  /** Returns the position of the tip at a place. */
-  private tip({ restM, outward: n }: Place, now: number): Lead {
-    const radiusM = this.reach.lengthM;
-    const outM = this.outM(now);
-    return { positionM: [restM[0] + outM * n[0], restM[1] + outM * n[1], restM[2] + outM * n[2]], radiusM, shape: this.reach.tipShape };
+  /** Returns the position of the tip at a place. The edge of a blade runs from there straight out of the tissue. */
+  private tip({ restM, outward }: Place, now: number): Lead {
+    const { lengthM, depthM, tipShape } = this.reach;
+    const positionM = plus(restM, outward, this.outM(now));
+    if (this.mode !== "blade") return { positionM, radiusM: lengthM, shape: tipShape };
+    const edgeM = plus([0, 0, 0], outward, EDGE * depthM);
+    return (this.bladeLead = { positionM, radiusM: BLADE * lengthM, shape: TipShape.BLADE, edgeM });
   }
 
   /** Returns the height of a tip above its place at rest: on its way from beside the tissue, or at its depth. */

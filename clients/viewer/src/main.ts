@@ -17,7 +17,7 @@ import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { Lumps } from "./lumps";
-import { feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./messages";
+import { cutText, feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, undoText, wayText, wellText } from "./messages";
 import { Overlay, type ToolLabel } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
 import { pageState } from "./page-state";
@@ -263,6 +263,8 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     onTrouble: (failure: Failure, waitMs: number) => shownSession === next && trouble(failure, waitMs),
     onWell: () => shownSession === next && status.found(wellText(next.session)),
     onBarred: (reason: string) => shownSession === next && barred(reason),
+    onFrame: () => stage.drawFrame(),
+    onCut: () => shownSession === next && stage.draw(),
   };
   const next = await ShownSession.to(session, holder, askedNumber("refinement", 0, 10), told, former);
   if (wanted !== opening) return false;
@@ -285,7 +287,6 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     hand.onChange = () => shownSession === next && holding();
     hand.onJaws = tellJaws;
   }
-  next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
   slider.max = String(next.mostRefinement);
@@ -351,6 +352,33 @@ async function whatWasThat(): Promise<void> {
   }
 }
 
+/** Offers to undo the last cut, or says why that is not possible. */
+function tellUndo(of: ShownSession): void {
+  const button = part("undo-cut", HTMLButtonElement);
+  const why = undoText(of);
+  button.hidden = of.session.severed === 0 || of.session.playback !== undefined;
+  button.disabled = why !== "";
+  button.title = why || "A new session that goes on from before the last cut. Others stay in this one.";
+}
+
+/** Goes on in a new session from the moment before the last cut. */
+async function undoCut(): Promise<void> {
+  const of = shownSession;
+  const before = of?.beforeCuts.at(-1);
+  if (!of || !before) return;
+  part("undo-cut", HTMLButtonElement).disabled = true;
+  try {
+    await of.hands.letGo();
+    const { session } = await sessions.createSession({ source: { case: "journal", value: before }, idleTimeoutS: IDLE_S }, { timeoutMs: CALL_TIMEOUT_MS });
+    if (!session) throw new RangeError("the server made no session");
+    if (shownSession !== of) return discard(session);
+    of.beforeCuts.pop();
+    await show(session, { isNew: true, keeps: true });
+  } catch (error) {
+    notice(`The cut can't be undone: ${describe(error)}.`);
+  }
+}
+
 /** Takes a picture of a scene that has none in the list, unless the user has touched it or turned the view. */
 function takePicture(of: ShownSession): void {
   const scene = of.session.scene?.name ?? "";
@@ -379,6 +407,7 @@ function heard(session: Session): void {
   player.heard(session);
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
+  tellUndo(shownSession);
   holding();
 }
 
@@ -409,7 +438,7 @@ function felt(of: ShownSession): void {
     const place = of.placeOf(tool);
     if (!place) return [];
     const hand = of.handOf(tool);
-    if (hand?.grasps) return [];
+    if (hand?.grasps || hand?.blade) return [];
     const strength = hand ? samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
     return [{ tool: tool.tool, place, forceN: tool.forceN, part: strength }];
   });
@@ -417,7 +446,7 @@ function felt(of: ShownSession): void {
     const forceN: Vec3 = samples.tools.find(({ tool }) => tool === grasper.tool.tool)?.forceN ?? [0, 0, 0];
     return (grasps && grasper.shown(forceN, norm(forceN) / reach.mostN)) || [];
   });
-  stage.setTools(shown, graspers);
+  stage.setTools(shown, graspers, hands.both.flatMap(({ blade }) => blade ?? []));
 }
 
 /** Returns what to write beside the tools of this page's hands; if there are none, beside the first tool. */
@@ -541,6 +570,7 @@ part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   tellControls();
 });
 part("what-was-that", HTMLButtonElement).addEventListener("click", () => void whatWasThat());
+part("undo-cut", HTMLButtonElement).addEventListener("click", () => void undoCut());
 part("reset-view", HTMLButtonElement).addEventListener("click", () => stage.resetView());
 const fullScreen = part("full-screen", HTMLButtonElement);
 fullScreen.hidden = !document.fullscreenEnabled;
@@ -666,6 +696,7 @@ setInterval(() => {
     auditedError: audited && Math.max(audited.displacement, audited.force),
     tolerance: session.scene?.stepping?.tolerance,
     cellsError: session.meshErrorEstimate?.relative,
+    cut: cutText(shownSession),
   });
 }, 1000);
 

@@ -233,6 +233,28 @@ export class Skin extends ShaderMaterial {
   }
 }
 
+/** Tissue between the lips of a wound, which little light reaches; and the lines along the lips, a little before what they lie on. */
+export class WoundInside extends ShaderMaterial {
+  constructor(colour: number, nearer: number) {
+    super({
+      side: DoubleSide,
+      uniforms: { colour: { value: new Color(colour) }, nearer: { value: nearer } },
+      vertexShader: `
+        uniform float nearer;
+        void main() {
+          gl_Position = projectionMatrix * viewMatrix * vec4(position, 1.0);
+          gl_Position.z -= nearer * gl_Position.w;
+        }`,
+      fragmentShader: `
+        uniform vec3 colour;
+        void main() {
+          gl_FragColor = vec4(colour, 1.0);
+          #include <colorspace_fragment>
+        }`,
+    });
+  }
+}
+
 /** The table that the tissue lies on. It fades into the background, and the tissue's shadow lies on it. */
 export class Table extends ShaderMaterial {
   constructor(isBody: boolean) {

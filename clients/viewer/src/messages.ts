@@ -46,7 +46,7 @@ export function refusedText(message: string, reason: string, { session }: ShownS
 
 /** Returns whether the strength of a tool is its depth. */
 export function isDeep(mode: Mode): boolean {
-  return mode === "tip" || mode === "grasper";
+  return mode === "tip" || mode === "blade" || mode === "grasper";
 }
 
 /** Describes the strength of the present tool. */
@@ -61,6 +61,12 @@ export function meaningText({ hand, reach, surface }: ShownSession): string {
   if (hand.mode === "tip") {
     const disc = reach.tipShape === TipShape.RIGID_DISC ? "a rigid disc" : "a disc";
     return `The tip is ${disc} of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
+  }
+  if (hand.mode === "blade") {
+    return (
+      "The blade stands upright in the tissue and cuts where you drag it. Depth is how far its point goes below the tissue at rest. " +
+      "What pushes back is what cutting takes, if the tissue has a toughness; a tissue with a pretension gapes."
+    );
   }
   if (hand.mode === "grasper") {
     return (
@@ -99,6 +105,23 @@ export function feltText({ hands, hand }: ShownSession, labels: readonly ToolLab
 function toldText(told: Told, verb: string): string {
   const force = `${verb}${quantity(told.allN, "N")}${verb === "" ? " back" : ""}`;
   return [depthText(told), force, jawsText(told)].filter((text) => text !== "").join(", ");
+}
+
+/** Describes what blades have cut, as far as it is known here; undefined if nothing is. */
+export function cutText({ session: { severed, pieces }, cutters, wound }: ShownSession): string | undefined {
+  if (severed === 0) return undefined;
+  const parts = pieces > 1 ? `, in ${pieces} pieces` : "";
+  const by = cutters.size > 0 ? `, by ${[...cutters].join(", ")}` : "";
+  return `${severed} springs${parts}${by}${wound.staysWhole ? "; drawn whole: it has other vertices than points" : ""}`;
+}
+
+/** Says why the last cut can't be undone; empty if it can. */
+export function undoText({ session: { sessionId, journal }, beforeCuts }: ShownSession): string {
+  if (!journal) return "This server keeps no journal, from which a cut could be undone.";
+  const before = beforeCuts.at(-1);
+  if (!before) return "It was cut before this page looked on. Look for the moment in the recording, and go on from there.";
+  const isDurable = before.sessionId !== sessionId || (journal.durableStep ?? -1n) >= before.step;
+  return isDurable ? "" : "The moment before the cut is not in the journal yet.";
 }
 
 /** Describes the transport of a touch: datagrams belong to a lease. */

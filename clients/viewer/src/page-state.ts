@@ -53,6 +53,12 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     get deepestM() {
       return Math.max(0, ...(present()?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
     },
+    /** What blades have cut, as the server tells it and as it is drawn. */
+    get wound() {
+      const { session, wound, surface } = present() ?? {};
+      const { shown, waiting } = surface?.wound.count ?? { shown: 0, waiting: 0 };
+      return { severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting };
+    },
     get holds() {
       return present()?.hands.holding !== undefined;
     },

@@ -3,12 +3,12 @@
 import { Body } from "./body";
 import { fingerM } from "./coefficients";
 import { isBarred } from "./token-form";
-import { fetchMesh, Frames, type MeshData, norm, plus, type Vec3 } from "palpate";
+import { fetchMesh, followWound, Frames, type FrameTold, type MeshData, norm, plus, type Vec3, Wound } from "palpate";
 import { type Session, TipShape } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { Hands } from "./hands";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
-import { type Failure, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
+import { type Failure, isUnimplemented, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
 import { gridOf, Sheet } from "./sheet";
 import type { Place, Surface } from "./surface";
 
@@ -23,11 +23,31 @@ const MAX_VERTICES = 1_500_000;
 /** Maximum number of points of a sheet. */
 const MAX_POINTS = 1 << 23;
 
+/** Interval between two requests for a wound of which the server does not know the newest version yet. */
+const WOUND_MS = 100;
+
+/** Changes of the topology within this time belong to one cut, s of simulated time. */
+const ONE_CUT_S = 1;
+
+/** A moment of a journal. */
+export interface JournalMoment {
+  sessionId: string;
+  run: number;
+  step: bigint;
+}
+
+/** Maximum number of those who cut that are named. */
+const MAX_CUTTERS = 8;
+
 /** Callbacks of a shown session. */
 export interface Told {
   onSession: (session: Session) => void;
   onTrouble: (failure: Failure, waitMs: number) => void;
   onWell: () => void;
+  /** A frame has arrived. */
+  onFrame: () => void;
+  /** What blades have cut has changed as it is drawn. */
+  onCut: () => void;
   /** What the caller may no longer do: the server's reason. */
   onBarred: (reason: string) => void;
 }
@@ -61,6 +81,22 @@ export class ShownSession {
   /** Simulated and local time, s, from the fastest recent answer, and that answer's round trip. */
   private clock: { timeS: number; localS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
   private readonly mesh: MeshData | undefined;
+  /** What blades have cut of the surface, as far as it is known here. */
+  wound: Wound;
+  /** The newest version of the topology that the server has told of. */
+  private cutVersion = 0;
+  private isFollowing = false;
+  /** Whether this server's wounds can be shown; if not, the surface stays whole. */
+  private canFollow = true;
+  /** Whether what is drawn may be the wound of another session. */
+  private hasFormerWound = false;
+  /** The moments before the cuts that this page saw, also in the sessions from which this one goes on. */
+  readonly beforeCuts: JournalMoment[];
+  private frame: FrameTold | undefined;
+  /** Simulated time of the last change of the topology, s. */
+  private cutS = -Infinity;
+  /** Who has cut while this page looked on. */
+  readonly cutters = new Set<string>();
 
   /**
    * Loads what the session shows: the surface of every tissue whose points are no grid. With `former`, takes over the
@@ -122,6 +158,11 @@ export class ShownSession {
       this.refinement = former?.refinement ?? Math.min(refinement ?? chosen, this.mostRefinement);
     }
     this.surface ??= former?.surface ?? this.newSheet();
+    this.wound = new Wound(this.surface.vertexCount, this.surface.triangleCount);
+    this.hasFormerWound = former !== undefined && (former.hasFormerWound || former.wound.version > 0);
+    this.cutVersion = session.topologyVersion;
+    this.beforeCuts = session.playback ? [] : (former?.beforeCuts ?? []);
+    this.frames.onFrame = (frame) => this.framed(frame);
     this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool), (tools) => this.joined(tools));
     // Until its own samples arrive, those of the former session are shown.
     if (former) this.samples.follow(former.samples, session.simulationTimeS);
@@ -186,6 +227,61 @@ export class ShownSession {
   begin(): void {
     void this.ask();
     this.look();
+    void this.followCuts();
+  }
+
+  private framed(frame: FrameTold): void {
+    this.told.onFrame();
+    this.noteMoment(frame);
+    this.cutVersion = Math.max(this.cutVersion, frame.topologyVersion);
+    void this.followCuts();
+  }
+
+  /** Asks for what blades have cut since, one request at a time, until it is as new as what the server has told of. */
+  private async followCuts(): Promise<void> {
+    if (this.isFollowing || !this.canFollow) return;
+    this.isFollowing = true;
+    const { signal } = this.ended;
+    try {
+      while (!signal.aborted && (this.hasFormerWound || this.wound.version < this.cutVersion)) {
+        const { surface, wound } = this;
+        const { version } = wound;
+        const change = await followWound(server, this.session.sessionId, this.refinement, wound, signal);
+        if (signal.aborted) return;
+        // Another refinement has another wound.
+        if (surface !== this.surface) continue;
+        this.hasFormerWound = false;
+        surface.wound.take(wound, change);
+        this.told.onCut();
+        if (wound.version === version) await sleep(WOUND_MS, signal);
+      }
+    } catch (error) {
+      this.canFollow = !(error instanceof RangeError || isUnimplemented(error));
+      // Another failure is told by the streams, and a later frame asks again.
+      await sleep(ASK_MS, signal);
+    } finally {
+      this.isFollowing = false;
+    }
+  }
+
+  /** Notes the moment before a cut that begins. */
+  private noteMoment(frame: FrameTold): void {
+    const { frame: before, session } = this;
+    this.frame = frame;
+    if (!before || frame.topologyVersion <= before.topologyVersion) return;
+    const isNew = frame.timeS - this.cutS > ONE_CUT_S;
+    this.cutS = frame.timeS;
+    if (isNew && session.journal && !session.playback) {
+      this.beforeCuts.push({ sessionId: session.sessionId, run: session.journal.run, step: before.step });
+    }
+  }
+
+  /** Notes who cuts: this page, or else whoever holds other tools. */
+  private noteCutters(before: Session, now: Session): void {
+    if (now.severed <= before.severed) return;
+    const { both } = this.hands;
+    if (both.some((hand) => hand.mode === "blade" && hand.holds)) return void this.cutters.add("you");
+    for (const { tool, holder } of now.heldTools) if (!this.hands.of(tool) && this.cutters.size < MAX_CUTTERS) this.cutters.add(holder || "somebody");
   }
 
   /** Opens the streams. */
@@ -221,6 +317,8 @@ export class ShownSession {
     if (this.mesh) return this.surface;
     this.refinement = n;
     this.surface = this.newSheet();
+    this.wound = new Wound(this.surface.vertexCount, this.surface.triangleCount);
+    void this.followCuts();
     if (!this.seen.signal.aborted) this.watch();
     return this.surface;
   }
@@ -283,7 +381,10 @@ export class ShownSession {
   }
 
   private heard(session: Session, begunMs: number, endedMs: number): void {
+    this.noteCutters(this.session, session);
     this.session = session;
+    this.cutVersion = Math.max(this.cutVersion, session.topologyVersion);
+    void this.followCuts();
     this.heardMs = endedMs;
     this.askedMs = begunMs;
     const roundTripMs = endedMs - begunMs;

@@ -7,6 +7,7 @@ import { SheetEdge } from "./sheet-edge";
 import type { Scene } from "palpate/v1";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
+import { ShownWound, type WoundedSurface } from "./wound";
 
 /** A sheet with fewer vertices than this would look coarse. */
 const MIN_VERTICES = 6000;
@@ -26,13 +27,16 @@ export function gridOf(scene: Scene | undefined): { points: [number, number]; sp
   return scene?.sheet && { points: [pointsX, pointsY], spacingM };
 }
 
-export class Sheet implements Surface {
+export class Sheet implements Surface, WoundedSurface {
   readonly field: Field;
   /** Geometry of the triangles. */
   readonly geometry = new BufferGeometry();
   /** Geometry of the lines between mass points. */
   readonly lines = new BufferGeometry();
   readonly edge: SheetEdge;
+  readonly wound = new ShownWound(this);
+  /** Whether a part is hidden: then mass points are drawn, whatever else is left out. */
+  private hasHidden = false;
   readonly box: Box3;
   readonly sizeM: number;
   readonly isOpen = false;
@@ -72,7 +76,7 @@ export class Sheet implements Surface {
   drawEvery(wanted: number): boolean {
     const { nx, ny } = this.field;
     let every = wanted;
-    while (every > 1 && nx * ny < MIN_VERTICES * every * every) every /= 2;
+    while (every > 1 && (nx * ny < MIN_VERTICES * every * every || (this.hasHidden && this.pointEvery % every !== 0))) every /= 2;
     if (every === this.every) return false;
     this.every = every;
     const among = (n: number) => Uint32Array.from({ length: Math.ceil((n - 1) / every) + 1 }, (_, i) => Math.min(i * every, n - 1));
@@ -102,16 +106,72 @@ export class Sheet implements Surface {
     this.geometry.setAttribute("normal", this.normal);
     this.geometry.setAttribute("open", this.open);
     this.geometry.setAttribute("uv", new BufferAttribute(uv, 2));
-    this.geometry.setIndex(new BufferAttribute(triangles, 1));
+    this.geometry.setIndex(new BufferAttribute(triangles, 1).setUsage(DynamicDrawUsage));
     this.lines.setAttribute("position", this.position);
     this.lines.setIndex(new BufferAttribute(gridLines(rows, columns, this.pointEvery), 1));
     this.edge.begin(this.position, this.normal, mx, my);
     this.work({ a0: 0, a1: mx - 1, b0: 0, b1: my - 1 });
+    this.wound.rebuild();
     return true;
+  }
+
+  get vertexCount(): number {
+    return this.field.nx * this.field.ny;
+  }
+
+  get triangleCount(): number {
+    return 2 * Math.max(this.field.nx - 1, 0) * Math.max(this.field.ny - 1, 0);
+  }
+
+  get pointsApartM(): number {
+    return this.pointSpacingM;
+  }
+
+  drawnVertex(vertex: number): number {
+    const { nx, ny } = this.field;
+    const drawn = (at: number, n: number, among: Uint32Array) => (at === n - 1 ? among.length - 1 : Math.floor(at / this.every));
+    return drawn(Math.floor(vertex / ny), nx, this.rows) * this.columns.length + drawn(vertex % ny, ny, this.columns);
+  }
+
+  restOf(vertex: number, c: number): number {
+    if (c === 2) return 0;
+    return this.spacingM * (c === 0 ? Math.floor(vertex / this.field.ny) : vertex % this.field.ny);
+  }
+
+  hide(first: number, count: number): void {
+    if (!this.hasHidden) {
+      this.hasHidden = true;
+      // With fewer vertices, the cells of mass points may not be drawn as such.
+      if (this.pointEvery % this.every !== 0) this.drawEvery(this.every);
+    }
+    const index = this.geometry.index!;
+    const { every } = this;
+    const [across, drawnAcross] = [this.field.ny - 1, this.columns.length - 1];
+    for (let t = first; t < first + count; t++) {
+      const cell = t >> 1;
+      const drawn = Math.floor(Math.floor(cell / across) / every) * drawnAcross + Math.floor((cell % across) / every);
+      // Of a refined sheet whole cells are hidden.
+      const at = every === 1 ? 3 * t : 6 * drawn;
+      const size = every === 1 ? 3 : 6;
+      (index.array as Uint32Array).fill(0, at, at + size);
+      index.addUpdateRange(at, size);
+    }
+    index.needsUpdate = true;
+  }
+
+  showAll(): void {
+    this.hasHidden = false;
+    const before = this.every;
+    this.every = 0;
+    this.drawEvery(before);
   }
 
   /** Updates positions and normals of what changed since the last picture. Call this before each picture. */
   refresh(): boolean {
+    return this.wound.refresh(this.move());
+  }
+
+  private move(): boolean {
     const changed = this.field.takeChanged();
     if (!changed) return false;
     const { nx, ny } = this.field;
@@ -366,6 +426,7 @@ export class Sheet implements Surface {
     this.geometry.dispose();
     this.lines.dispose();
     this.edge.geometry.dispose();
+    this.wound.dispose();
   }
 }
 

@@ -23,13 +23,14 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { BladeMark, isSameBlade, type ShownBlade } from "./blade-mark";
 import { Body } from "./body";
 import { Effort, isDrawnBySoftware } from "./effort";
 import type { ShownGrasper, View } from "./grasper";
 import { GrasperMark, isSamePose } from "./grasper-mark";
 import { Ground } from "./ground";
 import { defaultCameraOfBody, defaultCameraOfSheet } from "./default-camera";
-import { light, Skin, SHADOWS } from "./material";
+import { light, Skin, SHADOWS, WoundInside } from "./material";
 import { norm, type Vec3 } from "palpate";
 import type { Lump } from "./lumps";
 import type { Place, Surface } from "./surface";
@@ -87,6 +88,10 @@ export class Stage {
   private readonly ball = new SphereGeometry(1, 32, 24);
   private readonly lumpy = new MeshBasicMaterial({ color: 0x3d8bff, depthTest: false, transparent: true, opacity: 0.45 });
   private lumps: Mesh[] = [];
+  private readonly inside = new WoundInside(0x5a0d10, 0);
+  private readonly lip = new WoundInside(0x2e0608, 5e-4);
+  /** The parts of cut triangles, the tissue between the lips, and the lines along these. */
+  private wound: [Mesh, Mesh, LineSegments] | undefined;
   private mesh: Mesh | undefined;
   private edge: Mesh | undefined;
   private lines: LineSegments | undefined;
@@ -96,6 +101,8 @@ export class Stage {
   /** This page has two hands. */
   private readonly grasperMarks = [new GrasperMark(), new GrasperMark()];
   private graspers: ShownGrasper[] = [];
+  private readonly bladeMarks = [new BladeMark(), new BladeMark()];
+  private blades: ShownBlade[] = [];
   private aim: Place | undefined;
   /** Whether the camera is still in its initial position. */
   private isHome = true;
@@ -133,7 +140,7 @@ export class Stage {
     this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !this.isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.camera.up.set(0, 0, 1);
-    this.scene.add(this.camera, ...this.grasperMarks.map(({ group }) => group));
+    this.scene.add(this.camera, ...[...this.grasperMarks, ...this.bladeMarks].map(({ group }) => group));
     this.orbit = new OrbitControls(this.camera, canvas);
     // The left button and one finger control the tool.
     this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.PAN, RIGHT: MOUSE.ROTATE };
@@ -155,7 +162,7 @@ export class Stage {
    */
   show(surface: Surface, keepView: boolean, coveredPx = 0): void {
     if (!keepView) this.coveredPx = coveredPx;
-    for (const old of [this.mesh, this.edge, this.lines, this.ground?.mesh]) if (old) this.scene.remove(old);
+    for (const old of [this.mesh, this.edge, this.lines, this.ground?.mesh, ...(this.wound ?? [])]) if (old) this.scene.remove(old);
     this.surface?.dispose();
     this.ground?.dispose();
     this.surface = surface;
@@ -176,8 +183,10 @@ export class Stage {
     this.mesh = new Mesh(surface.geometry, skin);
     this.edge = surface.edge && new Mesh(surface.edge.geometry, skin);
     this.lines = new LineSegments(surface.lines, this.wires);
+    const { parts, bed, lips } = surface.wound;
+    this.wound = [new Mesh(parts, skin), new Mesh(bed, this.inside), new LineSegments(lips, this.lip)];
     this.ground = new Ground(surface, this.colour.table, this.colour.background);
-    for (const part of [this.mesh, this.edge, this.lines, this.ground.mesh]) {
+    for (const part of [this.mesh, this.edge, this.lines, this.ground.mesh, ...this.wound]) {
       if (!part) continue;
       // Computing the bounds of a moving surface is not worthwhile.
       part.frustumCulled = false;
@@ -226,6 +235,10 @@ export class Stage {
   setWireframe(on: boolean): void {
     this.wireframe = on;
     if (this.mesh) this.mesh.material = on ? this.hidden : this.skin;
+    if (this.wound) {
+      this.wound[0].material = on ? this.hidden : this.skin;
+      this.wound[1].visible = !on;
+    }
     if (this.lines) this.lines.visible = on;
     if (this.edge) this.edge.visible = !on;
     if (this.ground) this.ground.mesh.visible = !on;
@@ -246,13 +259,15 @@ export class Stage {
     this.draw();
   }
 
-  /** Shows tools, and this page's own graspers. */
-  setTools(tools: ShownTool[], graspers: ShownGrasper[] = []): void {
+  /** Shows tools, and this page's own graspers and blades. */
+  setTools(tools: ShownTool[], graspers: ShownGrasper[] = [], blades: ShownBlade[] = []): void {
     const isNear = ({ forceN, part }: { forceN: Vec3; part: number }, before: Vec3) => {
       const least = 2e-3 * (norm(forceN) / (part || 1));
       return forceN.every((v, c) => Math.abs(v - before[c]!) < least);
     };
     const isSame =
+      blades.length === this.blades.length &&
+      blades.every((blade, index) => isSameBlade(blade, this.blades[index]!)) &&
       graspers.length === this.graspers.length &&
       graspers.every((grasper, index) => {
         const old = this.graspers[index]!;
@@ -264,7 +279,7 @@ export class Stage {
         return tool.place.restM.every((v, c) => v === old.place.restM[c]) && isNear(tool, old.forceN);
       });
     if (isSame) return;
-    [this.tools, this.graspers] = [tools, graspers];
+    [this.tools, this.graspers, this.blades] = [tools, graspers, blades];
     while (this.marks.length < tools.length) {
       const mark = new ToolMark();
       this.marks.push(mark);
@@ -286,9 +301,14 @@ export class Stage {
       if (grasper && surface) mark.show(grasper, surface, surface.sizeM, index);
       else mark.hide();
     });
+    this.bladeMarks.forEach((mark, index) => {
+      const blade = this.held ? undefined : this.blades[index];
+      if (blade) mark.show(blade, this.graspers.length + index);
+      else mark.hide();
+    });
     this.marks.forEach((mark, index) => {
       const tool = this.held ? undefined : this.tools[index];
-      if (tool && surface) mark.show(tool, surface, surface.sizeM, this.seen, this.graspers.length + index);
+      if (tool && surface) mark.show(tool, surface, surface.sizeM, this.seen, this.graspers.length + this.blades.length + index);
       else mark.hide();
     });
     const ring = light.rings.value[SHADOWS]!;
@@ -301,6 +321,8 @@ export class Stage {
   tipInWindow(number: number): [number, number] | undefined {
     const grasper = this.graspers.findIndex(({ tool }) => tool === number);
     if (grasper >= 0) return this.inWindow(this.grasperMarks[grasper]!.endsM.toArray());
+    const blade = this.blades.findIndex(({ tool }) => tool === number);
+    if (blade >= 0) return this.inWindow(this.bladeMarks[blade]!.tipM.toArray());
     const mark = this.marks[this.tools.findIndex(({ tool }) => tool === number)];
     return mark && this.inWindow(mark.tipM.toArray());
   }
@@ -482,7 +504,8 @@ export class Stage {
     this.wanted = false;
     clearTimeout(this.later);
     this.later = undefined;
-    this.surface?.refresh();
+    // The rest of a large wound comes with the next pictures.
+    if (this.surface?.refresh()) requestAnimationFrame(() => this.draw());
     this.unseenM += this.surface?.takeMoved() ?? 0;
     if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * (this.surface?.sizeM ?? 1)) {
       this.drawn += 1;

@@ -30,6 +30,8 @@ export interface Figures {
   tolerance?: number;
   /** How much stiffer than infinitely small ones the cells of a solid are under a finger; missing if unknown. */
   cellsError?: number;
+  /** What blades have cut; missing while it is whole. */
+  cut?: string;
 }
 
 /** Limits beyond which the light is slow or lost. */
@@ -163,6 +165,7 @@ export class Status {
       const asked = figures.tolerance === undefined ? "" : ` (tolerance ${figures.tolerance.toExponential(0)})`;
       this.set("error", `${figures.auditedError.toExponential(0)}${asked}`);
     }
+    if (figures.cut !== undefined || this.values.has("cut")) this.set("cut", figures.cut ?? "nothing");
     if (figures.cellsError !== undefined) {
       const percent = 100 * figures.cellsError;
       this.set("error of the cells", `${percent >= 0 ? "+" : "−"}${Math.abs(percent).toFixed(0)} % of the stiffness`);

@@ -8,6 +8,7 @@ import type { Field, Vec3 } from "palpate";
 import type { SheetEdge } from "./sheet-edge";
 import type { ForceSchema, PositionSchema } from "palpate/v1";
 import type { Felt } from "./samples";
+import type { ShownWound, WoundedSurface } from "./wound";
 
 /** A place on the tissue. */
 export interface Place {
@@ -35,7 +36,7 @@ export interface Push {
   share: number;
 }
 
-export interface Surface {
+export interface Surface extends WoundedSurface {
   /** Displacements as the server sent them. */
   readonly field: Field;
   /**
@@ -44,6 +45,8 @@ export interface Surface {
   readonly geometry: BufferGeometry;
   /** Geometry of the lines between mass points. */
   readonly lines: BufferGeometry;
+  /** What blades have cut. */
+  readonly wound: ShownWound;
   /** The flank around a sheet. */
   readonly edge: SheetEdge | undefined;
   /** Bounding box of the tissue at rest, without its flank, m. */
@@ -57,8 +60,11 @@ export interface Surface {
 
   /** Draws fewer vertices, as far as possible. Returns true if the number changed. */
   drawEvery(wanted: number): boolean;
-  /** Updates what is drawn to the changes since the last picture. Call this before each picture. */
-  refresh(): void;
+  /**
+   * Updates what is drawn to the changes since the last picture. Call this before each picture. Returns whether a part of a large wound
+   * is left for the next one.
+   */
+  refresh(): boolean;
   /** Returns how far vertices moved since the last call, at most, m. */
   takeMoved(): number;
   /** Returns the largest displacement of any vertex, m. */

@@ -77,6 +77,32 @@ describe("the page at a hostile server", () => {
     await Promise.all(each);
   });
 
+  test("draws a tissue whole whose wound can't be shown, and asks for that no more", async () => {
+    const cut = { ...SESSION, topologyVersion: 7, severed: 3, pieces: 1 };
+    const lip = { host: 0, second: 1, secondPart: 0.5 };
+    const corners = many(60_000, () => 0);
+    /** @type {Record<string, Way>} */
+    const wounds = {
+      "a vertex that rides on none": async ({ say }) => void (await say({ version: 7, firstVertex: 289, vertices: [{ ...lip, host: 4_000_000_000 }], last: true })),
+      "triangles that are none": async ({ say }) => void (await say({ version: 7, firstVertex: 289, triangles: [{ first: 4_294_967_290, count: 4_294_967_290 }], last: true })),
+      "nothing at all": async () => {},
+      "a wound without an end": async ({ say }) => {
+        while (await say({ version: 7, firstVertex: 289, triangles: [{ first: 0, count: 1, corners }] }));
+      },
+    };
+    const each = Object.entries(wounds).map(([name, GetWound]) =>
+      at({ ...sessionOf(cut), GetWound }, async (page, { calls }) => {
+        while (!calls.get("GetWound")) await pause(50);
+        const taken = () => page.evaluate("window.palpate.frames.taken");
+        const before = Number(await taken());
+        while (Number(await taken()) < before + 20) await pause(100);
+        assert.deepEqual(await page.evaluate("[window.palpate.wound.shown, window.palpate.wound.vertices]"), [0, 0], name);
+        assert.equal(calls.get("GetWound"), 1, name);
+      }),
+    );
+    await Promise.all(each);
+  });
+
   test("shows text as text, and nothing that acts", async () => {
     const text = '<img src=x onerror="window.ran = true"><script>window.ran = true</script>\u0000\u001b[31m\u202e!';
     const session = { ...SESSION, scene: { ...SESSION.scene, name: text }, warnings: [text], heldTools: [{ tool: 0, holder: text }] };
