@@ -2,6 +2,7 @@
 //! server does not use it.
 
 mod canvas;
+mod drawn_surface;
 mod film;
 mod picture;
 mod surface;

@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3, Vec3Swizzles};
 
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
-use super::surface::{DrawnSurface, Vertex};
+use super::drawn_surface::{DrawnSurface, Vertex};
 use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_session::surface::{Refinement, Skin as Shown, Snapshot, Wound};
 use palpate_texture::Image;

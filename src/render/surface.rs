@@ -2,40 +2,13 @@
 
 use glam::{DVec2, DVec3};
 
-use super::wound::{DrawnWound, open_wound};
+use super::drawn_surface::{DrawnSurface, DrawnWound, Vertex};
+use super::wound::open_wound;
 use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, Wound, encode};
 use palpate_tissue::shape::RestShape;
 
 /// Factor over the median of texture per length above which a triangle is taken to cross a seam of the texture.
 const SEAM: f64 = 6.0;
-
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Vertex {
-    /// Position, m.
-    pub(super) at_m: DVec3,
-    /// Unit normal out of the tissue.
-    pub(super) normal: DVec3,
-    /// Texture coordinates, 0 to 1 along x and along y.
-    pub(super) share: DVec2,
-    /// For a mesh without texture coordinates: position at rest, 0 to 1 over the longest side, and how far the
-    /// surface faces each axis.
-    pub(super) rest: DVec3,
-    pub(super) facing: DVec3,
-    /// Fraction of ambient light that reaches the vertex: less in a dent.
-    pub(super) open: f64,
-}
-
-/// The vertices, triangles and lines that are drawn.
-#[derive(Debug)]
-pub(super) struct DrawnSurface {
-    pub(super) vertices: Vec<Vertex>,
-    pub(super) triangles: Vec<[usize; 3]>,
-    /// The ends of the lines that show the mesh.
-    pub(super) lines: Vec<[usize; 2]>,
-    /// Approximate number of vertices along a side.
-    pub(super) along: usize,
-    pub(super) wound: DrawnWound,
-}
 
 impl DrawnSurface {
     /// Computes the surface from the frame that a viewer would get of `snapshot`, and opens its wound.

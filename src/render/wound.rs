@@ -2,21 +2,12 @@
 
 use glam::DVec3;
 
-use super::surface::{DrawnSurface, Vertex};
+use super::drawn_surface::{DrawnSurface, DrawnWound, Vertex};
 use palpate_session::surface::Wound;
 use palpate_session::surface::wound::LipVertex;
 
 /// How far beneath the surface the dark tissue is drawn, as a fraction of the distance of neighbouring points.
 const DEPTH: f64 = 0.5;
-
-/// What is drawn of a wound besides the surface.
-#[derive(Debug, Default)]
-pub(super) struct DrawnWound {
-    /// Corners of the triangles of tissue beneath the lips, m.
-    pub(super) bed_m: Vec<[DVec3; 3]>,
-    /// The ends of the lines along both lips, by the vertices of the surface.
-    pub(super) lips: Vec<[usize; 2]>,
-}
 
 /// Opens a wound in a whole surface. `rest_m` returns the rest position of a vertex, m, and neighbouring points are `edge_m` apart.
 pub(super) fn open_wound(surface: &mut DrawnSurface, wound: &Wound, rest_m: impl Fn(usize) -> DVec3, edge_m: f64) {

@@ -338,7 +338,7 @@ fn the_wound_that_clients_are_tested_with_is_this_one() {
     assert!(whole.triangles.iter().any(|cut| cut.corners.len() == 6));
     let moved_m: Vec<DVec3> = (0..16).map(|at| 0.125 * DVec3::new(f64::from(at % 3), f64::from(at % 5), 1.0)).collect();
     let now = mesh.cut(&whole, &moved_m);
-    let numbers = |places: &[DVec3]| places.iter().flat_map(|place| place.to_array()).collect::<Vec<f64>>();
+    let numbers = |places: &[DVec3]| places.iter().flat_map(DVec3::to_array).collect::<Vec<f64>>();
     let message = |wound: &Wound| {
         let vertex = |lip: &LipVertex| {
             let third = if lip.others[0] == lip.others[1] { 0 } else { lip.others[1] };
