@@ -57,7 +57,7 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     get wound() {
       const { session, wound, surface } = present() ?? {};
       const { shown, waiting } = surface?.wound.count ?? { shown: 0, waiting: 0 };
-      return { severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting };
+      return { severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting, mostAtOnce: surface?.wound.mostAtOnce ?? 0 };
     },
     get holds() {
       return present()?.hands.holding !== undefined;

@@ -42,8 +42,8 @@ export class ShownWound {
   readonly parts = new BufferGeometry();
   readonly bed = new BufferGeometry();
   readonly lips = new BufferGeometry();
-  /** Cut triangles that the last picture took in; for tests. */
-  takenAtOnce = 0;
+  /** The most cut triangles that one picture took in; for tests. */
+  mostAtOnce = 0;
   private wound: Wound | undefined;
   private waiting: Cut[] = [];
   /** Drawn vertices: the number of each in the wound's numbering. */
@@ -90,7 +90,7 @@ export class ShownWound {
   /** Takes in a part of what waits, and follows the surface if that moved. Returns whether more waits. */
   refresh(hasMoved: boolean): boolean {
     const now = this.waiting.splice(0, CUTS_PER_PICTURE);
-    this.takenAtOnce = now.length;
+    this.mostAtOnce = Math.max(this.mostAtOnce, now.length);
     for (const cut of now) this.show(cut);
     if (now.length > 0) this.parts.index!.needsUpdate = this.lips.index!.needsUpdate = true;
     if (this.vertexOf.length > 0 && (hasMoved || now.length > 0 || this.isStale)) this.follow();

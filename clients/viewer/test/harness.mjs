@@ -221,7 +221,7 @@ export class Server {
  *   recording: { sessionId: string, run: number, begin: number, end: number, step: number, isPlaying: boolean, isBusy: boolean, speed: number, playback: string } | undefined,
  *   camera: number[],
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
- *   wound: { severed: number, pieces: number, version: number, vertices: number, shown: number, waiting: number },
+ *   wound: { severed: number, pieces: number, version: number, vertices: number, shown: number, waiting: number, mostAtOnce: number },
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>, thumbnail: () => string,
  * }} Inside State that the page exposes for tests (src/main.ts).
  */

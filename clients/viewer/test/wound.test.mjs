@@ -6,6 +6,7 @@ import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
 import { colourAt, pages, Server } from "./harness.mjs";
+import { Hostile, SESSION } from "./hostile.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
@@ -94,6 +95,25 @@ describe("a blade", () => {
     await page.picture("wound-undone");
     assert.deepEqual(page.complaints, []);
     await close(page);
+  });
+
+  test("that has cut a lot burdens no picture with all of it", async () => {
+    const session = { ...SESSION, topologyVersion: 1, severed: 3000, scene: { ...SESSION.scene, sheet: { ...SESSION.scene.sheet, pointsX: 41, pointsY: 41 } } };
+    const vertices = 161 * 161;
+    // 2500 triangles of the refined sheet, each in two parts, with a lip each.
+    const cut = Array.from({ length: 2500 }, (_, k) => ({ first: k, count: 1, corners: [k, vertices + k, k + 1, k + 1, vertices + k, k + 161] }));
+    const lips = cut.map((_, k) => ({ host: k, second: k + 1, secondPart: 0.5 }));
+    const fake = await Hostile.start({
+      CreateSession: async ({ say }) => void (await say({ session })),
+      GetSession: async ({ say }) => void (await say({ session })),
+      GetWound: async ({ say }) => void (await say({ version: 1, continues: true, firstVertex: vertices, vertices: lips, triangles: cut, severed: 3000, pieces: 1, last: true })),
+    });
+    const page = await open(fake.url);
+    await page.until(({ wound }) => wound.shown === 2500 && wound.waiting === 0);
+    const { mostAtOnce } = await page.ask(({ wound }) => wound);
+    assert.equal(mostAtOnce, 512);
+    await close(page);
+    await fake.stop();
   });
 
   test("is led by keys", async () => {
