@@ -3,7 +3,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { cross, dot, grasper, Instrument, InstrumentTool, norm, plus, rotated, rotationTo, Server, unit, vec, watchSamples } from "palpate";
+import { cross, dot, grasper, Instrument, InstrumentTool, knife, norm, plus, rotated, rotationTo, Server, unit, vec, watchSamples } from "palpate";
 import { InstrumentPart, TipShape } from "palpate/v1";
 import { Server as Program } from "../../viewer/test/harness.mjs";
 
@@ -84,6 +84,14 @@ test("a grasper has the tips that a script gives it", () => {
   // Spheres of closed jaws touch each other.
   const spheres = grasper({ ...jaws, shape: TipShape.SPHERE });
   assert.equal(norm(plus(spheres.tipM(0, { ...POSE, jawRad: 0 }), spheres.tipM(5, { ...POSE, jawRad: 0 }), -1)).toFixed(12), "0.003000000000");
+});
+
+test("the edge of a knife turns with the instrument", () => {
+  // It points down: its edge stands upright on its tip.
+  const [lead] = knife(0.02).leads({ positionM: [0.1, 0.2, -0.005], orientation: turn([0, Math.PI / 2, 0]), jawRad: 0 });
+  assert.deepEqual(lead?.positionM, [0.1, 0.2, -0.005]);
+  assert.equal(lead?.shape, TipShape.BLADE);
+  assert.ok(norm(plus(lead?.edgeM ?? assert.fail(), [0, 0, 0.02], -1)) < 1e-15);
 });
 
 test("a rotation turns the axes to three vectors, whichever of its components is largest", () => {
