@@ -98,7 +98,8 @@ describe("a blade", () => {
   });
 
   test("that has cut a lot burdens no picture with all of it", async () => {
-    const session = { ...SESSION, topologyVersion: 1, severed: 3000, scene: { ...SESSION.scene, sheet: { ...SESSION.scene.sheet, pointsX: 41, pointsY: 41 } } };
+    const sheet = { pointsX: 41, pointsY: 41, spacingM: 0.01, pointMassKg: 1e-3 };
+    const session = { ...SESSION, topologyVersion: 1, severed: 3000, scene: { ...SESSION.scene, sheet } };
     const vertices = 161 * 161;
     // 2500 triangles of the refined sheet, each in two parts, with a lip each.
     const cut = Array.from({ length: 2500 }, (_, k) => ({ first: k, count: 1, corners: [k, vertices + k, k + 1, k + 1, vertices + k, k + 161] }));
