@@ -71,7 +71,7 @@ impl ::prost::Name for Input {
     }
 }
 /// A command to a tool when it acted, or the end of a lease.
-#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Command {
     #[prost(uint32, tag = "1")]
     pub tool: u32,
@@ -99,12 +99,12 @@ pub struct Command {
     /// Not a client's command: it ends a lease and what its holder did with the tool.
     #[prost(bool, tag = "9")]
     pub ends_lease: bool,
-    #[prost(oneof = "command::Action", tags = "10, 11, 12, 13")]
+    #[prost(oneof = "command::Action", tags = "10, 11, 12, 13, 14")]
     pub action: ::core::option::Option<command::Action>,
 }
 /// Nested message and enum types in `Command`.
 pub mod command {
-    #[derive(Clone, Copy, PartialEq, ::prost::Oneof)]
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Action {
         #[prost(message, tag = "10")]
         Push(super::Push),
@@ -114,6 +114,8 @@ pub mod command {
         Pose(super::Pose),
         #[prost(message, tag = "13")]
         Release(super::Release),
+        #[prost(message, tag = "14")]
+        Tie(super::Tie),
     }
 }
 impl ::prost::Name for Command {
@@ -124,6 +126,53 @@ impl ::prost::Name for Command {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.Command".into()
+    }
+}
+/// A thread or clip, from its command's step on.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Tie {
+    #[prost(uint32, tag = "1")]
+    pub number: u32,
+    /// None: it is cut.
+    #[prost(message, repeated, tag = "2")]
+    pub bites: ::prost::alloc::vec::Vec<Bite>,
+    /// Of a thread, m. Absent: a clip.
+    #[prost(double, optional, tag = "3")]
+    pub length_m: ::core::option::Option<f64>,
+    /// Of a thread.
+    #[prost(double, tag = "4")]
+    pub friction: f64,
+    /// Absent: it does not break.
+    #[prost(double, optional, tag = "5")]
+    pub strength_n: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Tie {
+    const NAME: &'static str = "Tie";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.Tie".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.Tie".into()
+    }
+}
+/// A place at which a thread or clip holds the tissue.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Bite {
+    /// At rest, in the tissue's frame.
+    #[prost(message, optional, tag = "1")]
+    pub place_m: ::core::option::Option<crate::pb::Vector3>,
+    #[prost(double, tag = "2")]
+    pub radius_m: f64,
+}
+impl ::prost::Name for Bite {
+    const NAME: &'static str = "Bite";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.Bite".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.Bite".into()
     }
 }
 /// A force on the tissue.

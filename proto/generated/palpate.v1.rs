@@ -168,7 +168,7 @@ impl ::prost::Name for Extent {
     }
 }
 /// One command to one tool.
-#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Command {
     #[prost(uint32, tag = "1")]
     pub tool: u32,
@@ -187,13 +187,13 @@ pub struct Command {
     #[prost(double, optional, tag = "5")]
     pub time_to_live_s: ::core::option::Option<f64>,
     /// The action.
-    #[prost(oneof = "command::Action", tags = "6, 7, 8, 9, 10")]
+    #[prost(oneof = "command::Action", tags = "6, 7, 8, 9, 10, 11")]
     pub action: ::core::option::Option<command::Action>,
 }
 /// Nested message and enum types in `Command`.
 pub mod command {
     /// The action.
-    #[derive(Clone, Copy, PartialEq, ::prost::Oneof)]
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Action {
         #[prost(message, tag = "6")]
         Force(super::Force),
@@ -207,6 +207,10 @@ pub mod command {
         /// `release` are possible.
         #[prost(message, tag = "10")]
         Instrument(super::InstrumentPose),
+        /// Lays, changes or cuts a thread or clip of the session. What the tool does goes on, and the thread or clip stays when the tool is
+        /// released. Not on an instrument.
+        #[prost(message, tag = "11")]
+        Tie(super::Tie),
     }
 }
 impl ::prost::Name for Command {
@@ -217,6 +221,106 @@ impl ::prost::Name for Command {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Command".into()
+    }
+}
+/// A thread or clip from its command's step on. With the bites that it has already, only length, friction and strength change; with
+/// others it is laid anew.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Tie {
+    /// Chosen by the client: threads and clips of a session are numbered below the limit `ties`. Tools have numbers of their own.
+    #[prost(uint32, tag = "1")]
+    pub number: u32,
+    #[prost(oneof = "tie::Kind", tags = "2, 3, 4")]
+    pub kind: ::core::option::Option<tie::Kind>,
+}
+/// Nested message and enum types in `Tie`.
+pub mod tie {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Kind {
+        #[prost(message, tag = "2")]
+        Thread(super::Thread),
+        #[prost(message, tag = "3")]
+        Clip(super::Clip),
+        /// It is cut, and taken out.
+        #[prost(message, tag = "4")]
+        Cut(super::Release),
+    }
+}
+impl ::prost::Name for Tie {
+    const NAME: &'static str = "Tie";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Tie".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Tie".into()
+    }
+}
+/// A thread through places of the tissue, which pulls and never pushes. Its ends are held at the first and the last bite.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Thread {
+    /// 2 to 16, in the order in which it goes through them.
+    #[prost(message, repeated, tag = "1")]
+    pub bites: ::prost::alloc::vec::Vec<Bite>,
+    /// From the first bite to the last, m; above 0. It is drawn in at its last bite, by at most 0.1 m/s and with at most 100 N.
+    #[prost(double, tag = "2")]
+    pub length_m: f64,
+    /// μ of friction between thread and tissue, 0 to 10: at a bite at which the thread turns by the angle θ, tensions differ by a factor of
+    /// at most e^(μθ).
+    #[prost(double, tag = "3")]
+    pub friction: f64,
+    /// Tension at which it breaks, N; above 0. Absent: never.
+    #[prost(double, optional, tag = "4")]
+    pub strength_n: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Thread {
+    const NAME: &'static str = "Thread";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Thread".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Thread".into()
+    }
+}
+/// A clip, which closes by at most 0.1 m/s and then holds two places of the tissue together.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Clip {
+    /// Two.
+    #[prost(message, repeated, tag = "1")]
+    pub bites: ::prost::alloc::vec::Vec<Bite>,
+    /// As in `Thread`.
+    #[prost(double, optional, tag = "2")]
+    pub strength_n: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Clip {
+    const NAME: &'static str = "Clip";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Clip".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Clip".into()
+    }
+}
+/// A place at which a thread or clip holds the tissue: a disc, which moves with it.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Bite {
+    /// The middle of the disc is the place of the surface at rest nearest to this, at most a tenth of the tissue's longest side away.
+    #[prost(message, optional, tag = "1")]
+    pub place_m: ::core::option::Option<Vector3>,
+    /// Over which the force is spread, m.
+    #[prost(double, tag = "2")]
+    pub radius_m: f64,
+}
+impl ::prost::Name for Bite {
+    const NAME: &'static str = "Bite";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Bite".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Bite".into()
     }
 }
 /// From its step on, the tool exerts this force: point p gets force_n · exp(−falloff·r + offset), with r the distance
@@ -3180,7 +3284,7 @@ impl ::prost::Name for Springs {
         "/palpate.v1.Springs".into()
     }
 }
-/// How a tissue resists a blade.
+/// How a tissue is cut: how it resists a blade, and when it tears.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Cutting {
     /// Fracture toughness: the work of a cut for each unit of its area, J/m²; 0 or more. 0: a blade feels nothing.
@@ -3189,6 +3293,13 @@ pub struct Cutting {
     /// Thickness of what is cut, m; a blade that is deeper cuts no more. Absent: as deep as the blade is.
     #[prost(double, optional, tag = "2")]
     pub thickness_m: ::core::option::Option<f64>,
+    /// Strain of a spring beyond which it tears, from its length at rest: above 0 and at most 10. Absent: the tissue does not tear.
+    #[prost(double, optional, tag = "3")]
+    pub tear_strain: ::core::option::Option<f64>,
+    /// Length h₀ of a spring for which tear_strain is meant, m; one of length h then tears beyond tear_strain·√(h₀/h). Absent: all
+    /// tear at the same strain.
+    #[prost(double, optional, tag = "4")]
+    pub tear_reference_m: ::core::option::Option<f64>,
 }
 impl ::prost::Name for Cutting {
     const NAME: &'static str = "Cutting";

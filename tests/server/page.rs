@@ -213,7 +213,19 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
     let listed = sessions.list_scripts(pb::ListScriptsRequest::default()).await.unwrap().into_inner().script_names;
     assert_eq!(
         listed,
-        ["cut", "cut-solid", "grasp", "lift", "oblique-100", "oblique-60", "press", "push", "stroke", "vertical-60"]
+        [
+            "cut",
+            "cut-solid",
+            "grasp",
+            "lift",
+            "oblique-100",
+            "oblique-60",
+            "press",
+            "push",
+            "stroke",
+            "suture",
+            "vertical-60"
+        ]
     );
     let limits = Limits::default();
     let scene = Scene::load(&repository().join("scenes/paper.toml"), &[], &limits).unwrap();

@@ -460,6 +460,7 @@ async fn play(
         corrections: Vec::new(),
         recoveries,
         jaw_overloads: Vec::new(),
+        ties: Vec::new(),
         warnings: far_warning(measured.largest_displacement_m, scene.shape()).into_iter().collect(),
         largest_displacement_m: measured.largest_displacement_m,
         peak_reaction_n: measured.peak_reaction_n,

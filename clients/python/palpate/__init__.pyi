@@ -1,4 +1,4 @@
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from os import PathLike
 from typing import Any, Literal, Optional, Union, overload
 
@@ -232,6 +232,38 @@ class Session:
         """Holds a point, and moves it to this displacement from its place at rest by the end of the step."""
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
         """Moves a tool with a tip to `place_m` by the end of the step. It stays there until its next command."""
+    def thread(
+        self,
+        tool: int,
+        number: int,
+        bites_m: Sequence[Vector],
+        length_m: float,
+        *,
+        radius_m: float = 0.001,
+        friction: float = 0.0,
+        strength_n: Optional[float] = None,
+    ) -> None:
+        """Lays thread `number` through bites at these places of the tissue at rest, in their order, or changes its length, friction or
+        strength if it has these bites already. It has `length_m` from the first bite to the last, is drawn in at the last by at most
+        0.1 m/s, and breaks beyond a tension of `strength_n`. It stays when the tool, which does what it did, is released."""
+    def clip(
+        self,
+        tool: int,
+        number: int,
+        bites_m: Sequence[Vector],
+        *,
+        radius_m: float = 0.001,
+        strength_n: Optional[float] = None,
+    ) -> None:
+        """Closes clip `number` on two places of the tissue at rest, and holds them together; it opens beyond a force of `strength_n`.
+        Threads and clips share their numbers. It stays when the tool, which does what it did, is released."""
+    def untie(self, tool: int, number: int) -> None:
+        """Cuts a thread or clip, and takes it out."""
+    @property
+    def ties(self) -> dict[int, dict[str, Any]]:
+        """The threads and clips by their number, those that broke included: a dictionary for each, with `tensions_n` between successive
+        bites in the last step, the largest so far, `peak_n`, the thread's `length_m`, `path_m`, the distances between its bites in all,
+        and `is_broken`."""
     def release(self, tool: int) -> None:
         """Ends what a tool does."""
     def tool(self, tool: int) -> Optional[ToolState]:

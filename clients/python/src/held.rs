@@ -85,7 +85,7 @@ impl Held {
         let sequence = Some(1 + self.sequence.fetch_add(1, Ordering::Relaxed));
         let command = pb::Command { tool, sequence, action: Some(action), ..Default::default() };
         if let Some(lease_id) = leases.get(&tool) {
-            match send(&session, lease_id, vec![command]).await {
+            match send(&session, lease_id, vec![command.clone()]).await {
                 // The server that had the tool has ended, or the lease was not renewed for too long.
                 Err(error) if is_lost(&error) => drop(leases.remove(&tool)),
                 sent => return sent,

@@ -230,6 +230,7 @@ pub(crate) async fn play(
         corrections: Vec::new(),
         recoveries: ended.recoveries.into_iter().map(wire::sample::from_recovery).collect(),
         jaw_overloads: Vec::new(),
+        ties: Vec::new(),
         warnings,
         largest_displacement_m: f64::NAN,
         peak_reaction_n: f64::NAN,

@@ -12,6 +12,7 @@ use palpate_session::snapshot::Saved;
 use palpate_tissue::Model;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::scene::{self, Change};
 use palpate_tissue::shape::PointId;
 use pyo3::prelude::*;
@@ -50,6 +51,10 @@ impl SessionState {
     /// Gives a tool a command, which acts from the next step on.
     fn submit(&mut self, tool: u32, action: Action) -> Result<(), Refusal> {
         self.simulation.command(tool, action.clone())?;
+        // A thread or clip leaves the tool as it is.
+        if matches!(action, Action::Tie { .. }) {
+            return Ok(());
+        }
         self.tips.remove(&tool);
         match action {
             Action::Pose { place_m, tip, .. } => self.led.insert(tool, PoseTarget { place_m, tip }),
@@ -250,6 +255,65 @@ impl Session {
         self.submit(py, tool, Action::Pose { place_m, velocity_m_per_s: None, tip })
     }
 
+    /// Lays thread `number` through bites at these places of the tissue at rest, in their order, or changes its length, friction or
+    /// strength if it has these bites already. It has `length_m` from the first bite to the last, is drawn in at the last by at most
+    /// 0.1 m/s, and breaks beyond a tension of `strength_n`. It stays when the tool, which does what it did, is released.
+    #[pyo3(signature = (tool, number, bites_m, length_m, *, radius_m=0.001, friction=0.0, strength_n=None))]
+    #[allow(clippy::too_many_arguments)]
+    fn thread(
+        &self,
+        py: Python<'_>,
+        tool: u32,
+        number: u32,
+        bites_m: Vec<Bound<'_, PyAny>>,
+        length_m: f64,
+        radius_m: f64,
+        friction: f64,
+        strength_n: Option<f64>,
+    ) -> PyResult<()> {
+        let tie = Tie { bites: bites(&bites_m, radius_m)?, kind: TieKind::Thread { length_m, friction }, strength_n };
+        self.submit(py, tool, Action::Tie { number, tie: Some(tie) })
+    }
+
+    /// Closes clip `number` on two places of the tissue at rest, and holds them together; it opens beyond a force of `strength_n`.
+    /// Threads and clips share their numbers. It stays when the tool, which does what it did, is released.
+    #[pyo3(signature = (tool, number, bites_m, *, radius_m=0.001, strength_n=None))]
+    fn clip(
+        &self,
+        py: Python<'_>,
+        tool: u32,
+        number: u32,
+        bites_m: Vec<Bound<'_, PyAny>>,
+        radius_m: f64,
+        strength_n: Option<f64>,
+    ) -> PyResult<()> {
+        let tie = Tie { bites: bites(&bites_m, radius_m)?, kind: TieKind::Clip, strength_n };
+        self.submit(py, tool, Action::Tie { number, tie: Some(tie) })
+    }
+
+    /// Cuts a thread or clip, and takes it out.
+    fn untie(&self, py: Python<'_>, tool: u32, number: u32) -> PyResult<()> {
+        self.submit(py, tool, Action::Tie { number, tie: None })
+    }
+
+    /// The threads and clips by their number, those that broke included: a dictionary for each, with `tensions_n` between successive bites
+    /// in the last step, the largest so far, `peak_n`, the thread's `length_m`, `path_m`, the distances between its bites in all, and
+    /// `is_broken`.
+    #[getter]
+    fn ties<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for state in self.with(py, |inner| inner.simulation.session.tissue().ties()) {
+            let of = PyDict::new(py);
+            of.set_item("tensions_n", state.tensions_n)?;
+            of.set_item("peak_n", state.peak_n)?;
+            of.set_item("length_m", state.length_m)?;
+            of.set_item("path_m", state.path_m)?;
+            of.set_item("is_broken", state.is_broken)?;
+            all.set_item(state.number, of)?;
+        }
+        Ok(all)
+    }
+
     /// Ends what a tool does.
     fn release(&self, py: Python<'_>, tool: u32) -> PyResult<()> {
         self.submit(py, tool, Action::Release)
@@ -379,4 +443,9 @@ impl Session {
         write_into(py, &out, numbers)?;
         Ok(out)
     }
+}
+
+/// Returns the bites at some places, all with the same radius.
+fn bites(places_m: &[Bound<'_, PyAny>], radius_m: f64) -> PyResult<Vec<Bite>> {
+    places_m.iter().map(|place_m| Ok(Bite { place_m: vector("bites_m", place_m)?, radius_m })).collect()
 }

@@ -75,6 +75,11 @@ class Help(unittest.TestCase):
                 "(radius_m=0.005, *, friction=0.2, grasps=False, stiffness_n_per_m=None, damping_n_s_per_m=0.0, "
                 "shape='disc', edge_m=None)",
             ),
+            (
+                palpate.Session.thread,
+                "(self, /, tool, number, bites_m, length_m, *, radius_m=0.001, friction=0.0, strength_n=None)",
+            ),
+            (palpate.Session.clip, "(self, /, tool, number, bites_m, *, radius_m=0.001, strength_n=None)"),
             (palpate.Client.load, "(self, /, plan, *, report=None)"),
         ]:
             self.assertEqual(str(inspect.signature(there)), arguments)

@@ -155,7 +155,7 @@ describe("the page", () => {
     await page.until(() => document.querySelectorAll("#script option").length > 0);
     // Only those that are made for liver.
     const names = await page.page.locator("#script option").allTextContents();
-    assert.deepEqual(names, ["cut", "grasp", "press", "push", "stroke"]);
+    assert.deepEqual(names, ["cut", "grasp", "press", "push", "stroke", "suture"]);
     await page.page.selectOption("#script", "press");
     await page.page.click("#play");
     // By the plot: a picture may come too late for what lasts a second.

@@ -95,8 +95,8 @@ impl Intake {
                 return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
             }
             command.sequence = Some(sequence);
-            let leased_tip = leased_tip(command);
             let before_tip = coming.map_or(lease.leased_tip, |coming| coming.leased_tip);
+            let leased_tip = leased_tip(before_tip, command);
             check_tip(before_tip, leased_tip)?;
             if let (None, Some(now)) = (before_tip, leased_tip) {
                 let of = |(tool, waiting)| last.of(tool).map_or(waiting, |coming| coming.leased_tip);

@@ -277,14 +277,14 @@ impl Intake {
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(command.tool) {
             lease.last_sequence = lease.last_sequence.max(command.sequence);
-            lease.leased_tip = leased_tip(&command);
+            lease.leased_tip = leased_tip(lease.leased_tip, &command);
             let last = lease.last_key.replace(key);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply
             // to poses that are played by client time (`palpate_haptics::pose_playback`), where each one counts.
             let is_position = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
                 Action::Pose { .. } => command.at_step.is_some() || command.client_time_ns == 0,
-                Action::Push(_) | Action::Release => false,
+                Action::Push(_) | Action::Tie { .. } | Action::Release => false,
             };
             if let Some(last) = last.filter(|last| last.0 == step && is_position(&command))
                 && let Some(superseded) = self.queue.remove_if(command.tool, last, |due| is_position(&due.command))

@@ -82,7 +82,7 @@ impl Intake {
         if !due.ends_lease {
             self.counts.accepted += 1;
             if let Some(lease) = self.leases.get_mut(due.command.tool) {
-                lease.leased_tip = leased_tip(&due.command);
+                lease.leased_tip = leased_tip(lease.leased_tip, &due.command);
                 lease.last_key = Some(key);
             }
         }

@@ -490,6 +490,20 @@ impl Session {
             tool.client_time_ns = command.client_time_ns;
             tool.arrival_ns = command.arrival_ns;
         }
+        if matches!(command.action, Action::Tie { .. }) {
+            // What the tool does goes on.
+            if tool.paused_until.is_some_and(|end| step < end) {
+                self.paused_commands += 1;
+                return;
+            }
+            tool.late = late;
+            self.recoveries.note(step, command.tool);
+            self.recoveries.disturb();
+            if let Action::Tie { number, tie } = command.action.with_unsigned_zeros() {
+                self.tissue.tie(number as usize, tie);
+            }
+            return;
+        }
         let releases = command.action == Action::Release;
         tool.late = late;
         tool.expired = !releases && tool.paused_until.is_some_and(|end| step < end);
@@ -550,6 +564,8 @@ impl Session {
                 };
                 self.path_counts[1] += u64::from(!is_taken);
             }
+            // Done above.
+            Action::Tie { .. } => {}
             Action::Release => {
                 let tool = self.tool(index);
                 (tool.expires_at, tool.posed) = (None, None);

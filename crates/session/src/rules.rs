@@ -10,6 +10,7 @@ use palpate_tissue::rigid_tip_work;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_reach};
 use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::tie::{check_tie, check_tie_number};
 use palpate_tissue::shape::RestShape;
 
 /// Rules for the commands of one session that do not depend on their time: its scene and its limits. They never
@@ -68,7 +69,8 @@ impl Rules {
     /// - a grasp moved farther from rest, or a pose farther from the tissue's middle, than `limits.reach_in_sides`
     ///   times its longest side;
     /// - a pose with a velocity that has no client time or has a step ([`Reason::Missing`]);
-    /// - a tip that does not fit the tissue.
+    /// - a tip that does not fit the tissue;
+    /// - a thread or clip that does not fit it ([`check_tie`]), or a number of one above `limits.ties`.
     pub fn check_one(&self, command: &Command) -> Result<()> {
         if let Some(seconds) = command.time_to_live_s {
             positive("time_to_live_s", seconds)?;
@@ -91,6 +93,10 @@ impl Rules {
                 let centre_m = self.scene.shape().extent().middle_m();
                 check_reach("pose.position_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
                 action_check::check_tip("pose.tip", self.scene.shape(), tip)
+            }
+            Action::Tie { number, tie } => {
+                check_tie_number("tie.number", *number, &self.limits)?;
+                tie.as_ref().map_or(Ok(()), |tie| check_tie("tie", self.scene.shape(), tie, &self.limits))
             }
             Action::Release => Ok(()),
         }
@@ -157,9 +163,14 @@ impl From<Tip> for LeasedTip {
     }
 }
 
-/// Returns the tip that a command gives its tool; `None` if it gives none.
-pub(super) fn leased_tip(command: &Command) -> Option<LeasedTip> {
-    if let Action::Pose { tip, .. } = &command.action { Some((*tip).into()) } else { None }
+/// Returns the tip that a tool has after a command, if it had the tip `before`; `None` if it has none.
+pub(super) fn leased_tip(before: Option<LeasedTip>, command: &Command) -> Option<LeasedTip> {
+    match &command.action {
+        Action::Pose { tip, .. } => Some((*tip).into()),
+        // The tool goes on.
+        Action::Tie { .. } => before,
+        Action::Push(_) | Action::Grasp { .. } | Action::Release => None,
+    }
 }
 
 /// Refuses a change of the tip while it is in the tissue: the surface under a larger tip lies elsewhere, and

@@ -13,12 +13,12 @@ use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
-use palpate_tissue::scene::profile::PoseProfile;
+use palpate_tissue::scene::profile::{PoseProfile, TieProfile};
 use palpate_tissue::scene::record::{
-    JawOverload, Line, MAX_JAW_OVERLOADS, Record, Run, Summary, TopologyRecord, far_warning, write_line,
+    JawOverload, Line, MAX_JAW_OVERLOADS, Record, Run, Summary, TieRecord, TopologyRecord, far_warning, write_line,
 };
 use palpate_tissue::scene::script::{Script, forces_n};
-use palpate_tissue::{Model, StageTimes, Tissue};
+use palpate_tissue::{Model, StageTimes, TieState, Tissue};
 
 /// Returns the first line of a run: the names of scene and script, the stepping of the model (integrator, substeps
 /// per step, precision, steps per second), and the version of this program.
@@ -113,6 +113,7 @@ pub fn run_with(
     let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
     let (mut largest_displacement_m, mut peak_reaction_n, mut curves) = (0.0_f64, 0.0_f64, Curves::of(model.shape()));
     let (tip, mut on_fixed, mut jaws) = (script.first_tip(), None, WatchedJaws::of(script));
+    let mut ties = WatchedTies::of(script);
     for step in 0..script.steps {
         // The summary's clock stops during everything other than the session's own stepping.
         stepping_s += clock_s() - resumed_s;
@@ -133,6 +134,7 @@ pub fn run_with(
         }
         resumed_s = clock_s();
         session.advance(due, |session| {
+            ties.look(session);
             if jaws.has_any() {
                 stepping_s += clock_s() - resumed_s;
                 jaws.look(script, session);
@@ -184,6 +186,7 @@ pub fn run_with(
         corrections,
         recoveries: session.recoveries().list(),
         jaw_overloads: jaws.overloads,
+        ties: ties.records(script),
         warnings,
         largest_displacement_m,
         peak_reaction_n,
@@ -192,6 +195,42 @@ pub fn run_with(
     };
     tell(RunEvent::Summary(&summary))?;
     Ok(summary)
+}
+
+/// What the threads and clips of a script have borne.
+struct WatchedTies {
+    /// By number: the sum of the distances between its bites just after it was laid, m, and its newest state.
+    newest: Vec<Option<(f64, TieState)>>,
+}
+
+impl WatchedTies {
+    fn of(script: &Script) -> Self {
+        WatchedTies { newest: vec![None; script.ties.len()] }
+    }
+
+    fn look(&mut self, session: &Session) {
+        if self.newest.is_empty() {
+            return;
+        }
+        for state in session.tissue().ties() {
+            let Some(newest) = self.newest.get_mut(state.number) else { continue };
+            let laid_m = newest.as_ref().map_or(state.path_m, |newest| newest.0);
+            *newest = Some((laid_m, state));
+        }
+    }
+
+    fn records(&self, script: &Script) -> Vec<TieRecord> {
+        let laid = script.ties.iter().zip(&self.newest).filter_map(|(tie, newest)| Some((tie, newest.as_ref()?)));
+        let of = |(tie, (laid_m, state)): (&TieProfile, &(f64, TieState))| TieRecord {
+            name: tie.name.clone(),
+            peak_tension_n: state.peak_n,
+            length_m: state.length_m,
+            path_when_laid_m: *laid_m,
+            path_m: state.path_m,
+            is_broken: state.is_broken,
+        };
+        laid.map(of).collect()
+    }
 }
 
 /// The instruments of a script whose jaws have a limit, and when they exceeded it.
@@ -306,6 +345,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         corrections: Vec::new(),
         recoveries: Vec::new(),
         jaw_overloads: Vec::new(),
+        ties: Vec::new(),
         warnings: Vec::new(),
         largest_displacement_m: 0.0,
         peak_reaction_n: 0.0,

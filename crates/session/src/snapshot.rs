@@ -18,7 +18,7 @@
 //! that may differ.
 //!
 //! **Bytes**: [`MAGIC`], the version of the format, the length of the parts, XXH3-128 of everything else (16
-//! bytes), the parts as `postcard` encodes them, and the values at the points. All numbers are little-endian. The
+//! bytes), the parts as `postcard` encodes them, behind them the threads and clips if there are any, and the values at the points. All numbers are little-endian. The
 //! bytes are equal on every machine and at every width of vectors. The checksum detects damage, but an attacker can
 //! compute it again. So every value is checked when a snapshot is read or restored.
 
@@ -33,8 +33,8 @@ use palpate_haptics::pose_playback::{Path, PathState};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedPlan, SavedPoke, SavedTip, SavedTissue, TissueParts, ensure, tool_above,
-    unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedPlan, SavedPoke, SavedTies, SavedTip, SavedTissue, TissueParts, ensure,
+    tool_above, unsound,
 };
 use palpate_tissue::scene::record::Recovery;
 use palpate_tissue::{self as tissue, Model, Tissue};
@@ -285,7 +285,14 @@ impl Saved {
         };
         let parts: Parts = match postcard::take_from_bytes(parts) {
             Ok((parts, [])) => parts,
-            _ => return Err(unsound("parts that can't be read")),
+            Ok((mut parts, rest)) => {
+                parts.tissue.ties = match postcard::take_from_bytes::<SavedTies>(rest) {
+                    Ok((ties, [])) if !ties.is_empty() => ties,
+                    _ => return Err(unsound("threads or clips that can't be read")),
+                };
+                parts
+            }
+            Err(_) => return Err(unsound("parts that can't be read")),
         };
         if let Some(last) = parts.session.tools.len().checked_sub(1).filter(|last| *last >= limits.tools as usize) {
             return Err(tool_above(last as u64, limits));
@@ -313,7 +320,11 @@ fn checksum(header: &[u8], content: &[u8]) -> u128 {
 
 fn encoded(parts: &Parts, values: &[u8]) -> Vec<u8> {
     // Serialization of plain data to memory can't fail.
-    let parts = postcard::to_stdvec(parts).unwrap_or_default();
+    let mut bytes_of_parts = postcard::to_stdvec(parts).unwrap_or_default();
+    if !parts.tissue.ties.is_empty() {
+        bytes_of_parts.extend(postcard::to_stdvec(&parts.tissue.ties).unwrap_or_default());
+    }
+    let parts = bytes_of_parts;
     let mut bytes = Vec::with_capacity(HEADER + parts.len() + values.len());
     bytes.extend_from_slice(&MAGIC);
     bytes.extend_from_slice(&VERSION.to_le_bytes());

@@ -13,11 +13,13 @@ use crate::body::severed::Cuts;
 use crate::kernel::field::BLOCK;
 use crate::saved::SavedTissue;
 use crate::scene::profile::Poke;
+use crate::scene::tie::Tie;
 use crate::shape::{PointId, PointName};
 use crate::stage_times::StageTimes;
 use crate::tools::applied_force::Push;
 use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
+use crate::tools::tie::TieState;
 use palpate_haptics::Tip;
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on it, as vectors in the
@@ -183,6 +185,12 @@ pub trait Tissue: Send {
     /// step's end, and stays there until its next pose. The tool no longer pushes or grasps a point. Tip and
     /// place aren't checked: see [`check_tip`](crate::scene::action_check::check_tip).
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip);
+    /// Lays thread or clip number `number` from the next step on, or cuts it and takes it out (`None`). With the bites that it has already,
+    /// only its length, friction or strength changes. Numbers are those of threads and clips alone, from 0: tools have others. Isn't
+    /// checked: see [`check_tie`](crate::scene::tie::check_tie).
+    fn tie(&mut self, number: usize, tie: Option<Tie>);
+    /// Returns the threads and clips, by ascending number, those that broke included.
+    fn ties(&self) -> Vec<TieState>;
     /// Returns the motion of a tool with a tip ([`Tissue::pose`]) and the force on it; `None` for other tools.
     fn tool_contact(&self, tool: usize) -> Option<ToolContact>;
     /// Returns a copy of the tissue around a tool with a tip, from which another thread can compute the

@@ -39,3 +39,4 @@ pub use tools::applied_force::Push;
 pub use tools::contact::{TangentInput, ToolContact};
 pub use tools::prescribed::Grasp;
 pub use tools::rigid_tip::rigid_tip_work;
+pub use tools::tie::TieState;

@@ -38,6 +38,8 @@ pub struct Limits {
     pub journal_s: f64,
     /// Tools of a session, and of a script. Their numbers are below this. Default: 64.
     pub tools: u32,
+    /// Threads and clips of a session, and of a script. Their numbers are below this. Default: 64.
+    pub ties: u32,
     /// Commands per tool that wait for their step. Default: 4096.
     pub queued_commands_per_tool: usize,
     /// Samples that wait for one reader. Beyond it, the oldest is dropped. Default: 64.
@@ -152,6 +154,7 @@ impl Default for Limits {
             journals_per_caller: 2,
             journal_s: 600.0,
             tools: 64,
+            ties: 64,
             queued_commands_per_tool: 4096,
             queued_samples: 64,
             queued_records: 64,

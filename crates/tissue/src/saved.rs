@@ -23,6 +23,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use crate::limits::Limits;
 use crate::scene::action_check::check_tip;
 use crate::scene::profile::{CentreProfile, LoadProfile, Motion, MotionProfile, Move, Poke, Profile, StrengthProfile};
+use crate::scene::tie::{Bite, Tie, TieKind, check_tie_number};
 use crate::scene::{Integrator, Named, Precision};
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -154,6 +155,9 @@ pub struct TissueParts {
     pub(crate) guard_events: u64,
     pub(crate) substeps_done: u64,
     pub(crate) points_done: u64,
+    /// The threads and clips, which a snapshot keeps behind everything else.
+    #[serde(skip)]
+    pub ties: SavedTies,
 }
 
 /// The state that the guard goes back to.
@@ -219,6 +223,45 @@ pub(crate) enum SavedInput {
     Push(Option<Box<SavedPush>>),
     Grasp(u64, SavedGrasp),
     Pose(Vector, SavedTip),
+    Tie(Option<Box<SavedBites>>),
+}
+
+/// A thread or clip as it was commanded.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedBites {
+    /// Place and radius of each bite, m.
+    bites: Vec<(Vector, f64)>,
+    /// Length, m, and friction of a thread; `None` for a clip.
+    thread: Option<(f64, f64)>,
+    strength_n: Option<f64>,
+}
+
+/// A thread or clip and what it holds.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedTie {
+    pub(crate) number: u64,
+    pub(crate) tie: SavedBites,
+    pub(crate) lengths_m: Vec<f64>,
+    pub(crate) apart_m: Vector,
+    pub(crate) forces_n: Vec<Vector>,
+    pub(crate) tensions_n: Vec<f64>,
+    pub(crate) peak_n: f64,
+    pub(crate) is_broken: bool,
+}
+
+/// The threads and clips of a saved tissue, and those of its checkpoint. A snapshot without any has the bytes that it had before there were
+/// some.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SavedTies {
+    pub(crate) now: Vec<SavedTie>,
+    pub(crate) at_checkpoint: Vec<SavedTie>,
+}
+
+impl SavedTies {
+    /// Returns whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.now.is_empty() && self.at_checkpoint.is_empty()
+    }
 }
 
 /// The forces of all tools.
@@ -466,6 +509,15 @@ impl Checks<'_> {
         Err(tool_above(tool, self.limits))
     }
 
+    /// Checks the number of a thread or clip, from 0, and returns it.
+    ///
+    /// # Errors
+    /// Refuses a number that is not below `limits.ties` ([`Reason::TooLarge`]).
+    pub(crate) fn tie(&self, tie: u64) -> Result<usize> {
+        let number = u32::try_from(tie).unwrap_or(u32::MAX);
+        check_tie_number(SNAPSHOT, number, self.limits).map(|()| number as usize)
+    }
+
     /// Checks the index of a point, from 0 in the numbering of [`PointId`], and returns the point.
     ///
     /// # Errors
@@ -631,6 +683,29 @@ const TIP_KINDS: [(TipShape, bool); 5] = [
     (TipShape::Sphere, false),
     (TipShape::Blade, false),
 ];
+
+impl SavedBites {
+    /// Converts a tie to plain data, without rounding.
+    pub(crate) fn of(tie: &Tie) -> Self {
+        SavedBites {
+            bites: tie.bites.iter().map(|Bite { place_m, radius_m }| ((*place_m).into(), *radius_m)).collect(),
+            thread: match tie.kind {
+                TieKind::Thread { length_m, friction } => Some((length_m, friction)),
+                TieKind::Clip => None,
+            },
+            strength_n: tie.strength_n,
+        }
+    }
+
+    /// Returns the tie, whose numbers are finite. The rest is for [`check_tie`](crate::scene::tie::check_tie).
+    pub(crate) fn restored(&self, checks: &Checks<'_>) -> Result<Tie> {
+        let bites = self.bites.iter().map(|(place_m, radius_m)| {
+            Ok(Bite { place_m: checks.vector(*place_m)?, radius_m: checks.number(*radius_m)? })
+        });
+        let kind = self.thread.map_or(TieKind::Clip, |(length_m, friction)| TieKind::Thread { length_m, friction });
+        Ok(Tie { bites: bites.collect::<Result<_>>()?, kind, strength_n: self.strength_n })
+    }
+}
 
 impl SavedTip {
     /// Converts a tip to plain data, without rounding.

@@ -87,6 +87,9 @@ fn kind(command: &pb::Command) -> &'static str {
         Some(Action::Grasp(_)) => "grasps",
         Some(Action::Pose(pose)) if pose.tip.is_some_and(|tip| tip.grasps) => "holds with its tip",
         Some(Action::Pose(_)) => "touches with its tip",
+        Some(Action::Tie(tie)) if tie.bites.is_empty() => "cuts a thread or clip",
+        Some(Action::Tie(tie)) if tie.length_m.is_some() => "leads a thread",
+        Some(Action::Tie(_)) => "leads a clip",
         Some(Action::Release(_)) | None => "is released",
     }
 }
@@ -101,6 +104,7 @@ fn told(command: &pb::Command) -> String {
         Some(Action::Push(push)) => format!("{kind} with {} N at {} m", vector(push.force_n), vector(push.centre_m)),
         Some(Action::Grasp(grasp)) => format!("{kind} point {} by {} m", grasp.point, vector(grasp.displacement_m)),
         Some(Action::Pose(pose)) => format!("{kind} at {} m", vector(pose.place_m)),
+        Some(Action::Tie(tie)) => format!("{kind}, number {}", tie.number),
         Some(Action::Release(_)) | None => kind.to_owned(),
     }
 }
@@ -174,6 +178,15 @@ fn in_json(input: &pb::Input) -> Value {
             Some(Action::Pose(pose)) => {
                 line["pose"] = json!({ "place_m": vector(pose.place_m), "velocity_m_per_s": vector(pose.velocity_m_per_s),
                     "shape": pose.tip.and_then(|tip| TipShape::ALL.get(tip.shape as usize)).map(|shape| shape.name()), "radius_m": pose.tip.map(|tip| tip.radius_m), "grasps": pose.tip.map(|tip| tip.grasps) });
+            }
+            Some(Action::Tie(tie)) => {
+                let bites: Vec<Value> = tie
+                    .bites
+                    .iter()
+                    .map(|bite| json!({ "place_m": vector(bite.place_m), "radius_m": bite.radius_m }))
+                    .collect();
+                line["tie"] = json!({ "number": tie.number, "bites": bites, "length_m": tie.length_m, "friction": tie.friction,
+                    "strength_n": tie.strength_n });
             }
             Some(Action::Release(_)) | None => {}
         }

@@ -6,3 +6,4 @@ mod contact;
 mod instruments;
 mod laws;
 mod poses;
+mod ties;

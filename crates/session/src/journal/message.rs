@@ -22,6 +22,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::saved::{CorrectedPlan, SavedPlan};
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::scene::{Appearance, Integrator, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
 
@@ -280,6 +281,7 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
                 tip: (!is_same).then_some(tip),
             })
         }
+        Action::Tie { number, tie } => Message::Tie(of_tie(*number, tie.as_ref())),
         Action::Release => Message::Release(pb::Release {}),
     };
     pb::Command {
@@ -294,6 +296,26 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
         ends_lease: *ends_lease,
         action: Some(action),
     }
+}
+
+/// Returns a thread or clip as a message.
+fn of_tie(number: u32, tie: Option<&Tie>) -> pb::Tie {
+    let bite = |bite: &Bite| pb::Bite { place_m: vector(bite.place_m), radius_m: bite.radius_m };
+    let bites = tie.map_or_else(Vec::new, |tie| tie.bites.iter().map(bite).collect());
+    let (length_m, friction) = match tie.map(|tie| tie.kind) {
+        Some(TieKind::Thread { length_m, friction }) => (Some(length_m), friction),
+        Some(TieKind::Clip) | None => (None, 0.0),
+    };
+    pb::Tie { number, bites, length_m, friction, strength_n: tie.and_then(|tie| tie.strength_n) }
+}
+
+/// Returns the thread or clip in a message; without bites it is cut.
+fn from_tie(message: &pb::Tie) -> Option<Tie> {
+    let bite = |bite: &pb::Bite| Bite { place_m: from_vector(bite.place_m.as_ref()), radius_m: bite.radius_m };
+    let kind =
+        message.length_m.map_or(TieKind::Clip, |length_m| TieKind::Thread { length_m, friction: message.friction });
+    let bites: Vec<Bite> = message.bites.iter().map(bite).collect();
+    (!bites.is_empty()).then_some(Tie { bites, kind, strength_n: message.strength_n })
 }
 
 /// Fills in the tips that poses of a batch leave out.
@@ -362,6 +384,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
                 },
             }
         }
+        Message::Tie(message) => Action::Tie { number: message.number, tie: from_tie(message) },
         Message::Release(_) => Action::Release,
     };
     let command = Command {

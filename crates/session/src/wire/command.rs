@@ -11,6 +11,7 @@ use crate::command::Command;
 use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::shape::{PointId, RestShape};
 
 /// Returns the command in a message that arrived at `arrival_ns`, ns of the server's clock. `shape` is the rest shape
@@ -56,6 +57,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
             velocity_m_per_s: pose.velocity_m_per_s.as_ref().map(|velocity| from_vector(Some(velocity))),
             tip: from_tip("pose.tip", pose.tip.as_ref())?,
         },
+        Message::Tie(message) => Action::Tie { number: message.number, tie: from_tie(shape, message)? },
         Message::Release(_) => Action::Release,
         Message::Instrument(_) => {
             let message =
@@ -96,6 +98,46 @@ fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
     let is_vertex = vertex.is_some() || point.is_none() && shape.grid().is_none();
     let field = if is_vertex { "position.vertex" } else { "position.point" };
     shape.find(field, required(field, from_point(point, vertex))?)
+}
+
+/// Returns the thread or clip in a message; `None` if it is cut.
+fn from_tie(shape: &dyn RestShape, message: &pb::Tie) -> Result<Option<Tie>> {
+    use pb::tie::Kind;
+    let bites = |field: &str, bites: &[pb::Bite]| -> Result<Vec<Bite>> {
+        let of = |(index, bite): (usize, &pb::Bite)| {
+            let place_m = required(&format!("{field}.bites[{index}].place_m"), bite.place_m.as_ref())?;
+            let place_m = shape.in_rest_space_m(from_vector(Some(place_m)));
+            Ok(Bite { place_m, radius_m: bite.radius_m })
+        };
+        bites.iter().enumerate().map(of).collect()
+    };
+    Ok(Some(match required("tie.kind", message.kind.as_ref())? {
+        Kind::Thread(thread) => Tie {
+            bites: bites("tie.thread", &thread.bites)?,
+            kind: TieKind::Thread { length_m: thread.length_m, friction: thread.friction },
+            strength_n: thread.strength_n,
+        },
+        Kind::Clip(clip) => {
+            Tie { bites: bites("tie.clip", &clip.bites)?, kind: TieKind::Clip, strength_n: clip.strength_n }
+        }
+        Kind::Cut(_) => return Ok(None),
+    }))
+}
+
+/// Returns a thread or clip as a message; `None` is one that is cut.
+pub fn tie(number: u32, tie: Option<&Tie>) -> pb::Tie {
+    use pb::tie::Kind;
+    let of = |tie: &Tie| {
+        let bite = |bite: &Bite| pb::Bite { place_m: vector(bite.place_m), radius_m: bite.radius_m };
+        let (bites, strength_n) = (tie.bites.iter().map(bite).collect(), tie.strength_n);
+        match tie.kind {
+            TieKind::Thread { length_m, friction } => {
+                Kind::Thread(pb::Thread { bites, length_m, friction, strength_n })
+            }
+            TieKind::Clip => Kind::Clip(pb::Clip { bites, strength_n }),
+        }
+    };
+    pb::Tie { number, kind: Some(tie.map_or(Kind::Cut(pb::Release {}), of)) }
 }
 
 /// Returns the position of a pose's tip, m: the position plus the turned offset of the tip.
@@ -141,6 +183,7 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
         Action::Pose { place_m, velocity_m_per_s, tip } => {
             Message::Pose(pb::Pose { velocity_m_per_s: velocity_m_per_s.and_then(vector), ..pose(*place_m, tip) })
         }
+        Action::Tie { number, tie: laid } => Message::Tie(tie(*number, laid.as_ref())),
         Action::Release => Message::Release(pb::Release {}),
     };
     let (tool, sequence, action) = (tool as u32, Some(at_step + 1), Some(action));

@@ -64,10 +64,14 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         },
         sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
         appearance: Appearance::default(),
-        cutting: message.cutting.map_or_else(Cutting::default, |pb::Cutting { toughness_j_per_m2, thickness_m }| {
-            Cutting { toughness_j_per_m2, thickness_m }
-        }),
+        cutting: message.cutting.map_or_else(Cutting::default, from_cutting),
     })
+}
+
+/// Returns how a tissue is cut.
+fn from_cutting(message: pb::Cutting) -> Cutting {
+    let pb::Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m } = message;
+    Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m }
 }
 
 /// Returns a tissue whose coefficients the message gives.
@@ -459,6 +463,8 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         cutting: (scene.cutting != Cutting::default()).then_some(pb::Cutting {
             toughness_j_per_m2: scene.cutting.toughness_j_per_m2,
             thickness_m: scene.cutting.thickness_m,
+            tear_strain: scene.cutting.tear_strain,
+            tear_reference_m: scene.cutting.tear_reference_m,
         }),
     }
 }

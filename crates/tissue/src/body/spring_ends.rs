@@ -79,6 +79,15 @@ impl Model {
         }
     }
 
+    /// Returns whether a spring of a place joins neighbours, so that it stands for the material between them. The others resist bending.
+    pub(crate) fn joins_neighbours(&self, place: usize, spring: &SpringEnd) -> bool {
+        match &self.places {
+            Places::Sheet(_) => spring.number < SHEET_ENDS - 4,
+            Places::Surface(_) => self.shape().neighbours(self.point_at(place)).contains(&self.point_at(spring.other)),
+            Places::Solid(_) => true,
+        }
+    }
+
     /// Returns the springs of the point at a place in memory, by ascending number.
     pub(crate) fn springs_at(&self, place: usize) -> Vec<SpringEnd> {
         let mut springs = Vec::new();

@@ -1,8 +1,9 @@
-//! The actions of a tool: push, grasp, pose, release.
+//! The actions of a tool: push, grasp, pose, tie, release.
 
 use glam::DVec3;
 
 use super::profile::Poke;
+use super::tie::Tie;
 use crate::shape::PointId;
 use palpate_haptics::Tip;
 
@@ -29,6 +30,14 @@ pub enum Action {
         velocity_m_per_s: Option<DVec3>,
         /// The tool's tip: its radius, friction and coupling.
         tip: Tip,
+    },
+    /// Lays a thread or clip, or changes the length, friction or strength of one, or cuts it. It stays when the tool is released, and
+    /// what the tool does goes on.
+    Tie {
+        /// Its number, from 0, below `limits.ties`.
+        number: u32,
+        /// What ties which bites; `None` cuts it and takes it out.
+        tie: Option<Tie>,
     },
     /// Ends the tool's action: it no longer pushes, grasps or touches.
     Release,

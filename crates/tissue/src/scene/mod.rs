@@ -25,6 +25,7 @@ mod solid;
 mod source;
 mod springs;
 mod stepping;
+pub mod tie;
 pub mod toml_document;
 mod volume;
 mod zero;

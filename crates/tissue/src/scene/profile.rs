@@ -8,6 +8,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_haptics::{Instrument, InstrumentPose, Tip};
 
+use super::tie::{Tie, TieKind};
 use crate::shape::{self, PointId, RestShape};
 
 /// A moment within a step. A profile that jumps has its value before the jump at (n − 1, 1), and its value
@@ -234,6 +235,33 @@ impl PoseProfile {
         }
         let (from_m, to) = reached(&self.poses, self.until_s, time_s)?;
         Some(to.map_or(*from_m, |(to_m, part)| *from_m + (*to_m - *from_m) * part))
+    }
+}
+
+/// A thread or clip over time. It is laid at the first of its times, and cut at `until_s`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TieProfile {
+    /// Its name, for people; empty without.
+    pub name: String,
+    /// The thread or clip, with its first length.
+    pub tie: Tie,
+    /// Times, s, and lengths of the thread, m, by strictly ascending time; at least one. Between two of them the length changes with the
+    /// smooth profile of a [`Move`]; after the last it stays. The lengths of a clip are 0.
+    pub lengths_m: Vec<(f64, f64)>,
+    /// Time at which it is cut, s, later than the first; infinite if it stays.
+    pub until_s: f64,
+}
+
+impl TieProfile {
+    /// Returns the thread or clip at a time, s; `None` before it is laid and from `until_s` on.
+    pub fn at(&self, time_s: f64) -> Option<Tie> {
+        let (from_m, to) = reached(&self.lengths_m, self.until_s, time_s)?;
+        let now_m = to.map_or(*from_m, |(to_m, part)| from_m + (to_m - from_m) * part);
+        let kind = match self.tie.kind {
+            TieKind::Thread { friction, .. } => TieKind::Thread { length_m: now_m, friction },
+            TieKind::Clip => TieKind::Clip,
+        };
+        Some(Tie { kind, ..self.tie.clone() })
     }
 }
 

@@ -202,6 +202,9 @@ pub struct Summary {
     /// How blades have changed what joins the points; `None`, and not written, for a replay.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub topology: Option<TopologyRecord>,
+    /// What the threads and clips bore, in the order of the script; not written if it has none. Of a replay always empty.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub ties: Vec<TieRecord>,
     /// XXH3-128 hash of the final state (`Tissue::state_hash`), 32 hexadecimal
     /// digits.
     pub final_hash: String,
@@ -253,6 +256,23 @@ pub struct TopologyRecord {
     pub severed: usize,
     /// Number of parts of the tissue; 1 for one that is whole.
     pub pieces: usize,
+}
+
+/// What a thread or clip bore in a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TieRecord {
+    /// Its name in the script; empty without.
+    pub name: String,
+    /// The largest tension between two of its bites in any step, N.
+    pub peak_tension_n: f64,
+    /// Length of the thread at the end, m, without its stretch; of a clip how far it is from being closed.
+    pub length_m: f64,
+    /// Sum of the distances between its successive bites just after it was laid, m.
+    pub path_when_laid_m: f64,
+    /// That sum at the end, or just before it was cut.
+    pub path_m: f64,
+    /// Whether it broke.
+    pub is_broken: bool,
 }
 
 /// Largest number of [`Summary::jaw_overloads`].

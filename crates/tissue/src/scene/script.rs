@@ -7,14 +7,14 @@ use glam::DVec3;
 
 use super::Change;
 pub use super::action::Action;
-use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile};
+use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile, TieProfile};
 use super::record::{ContactRecord, InstrumentRecord, PortRecord, ToolRecord};
 use crate::shape::{PointId, RestShape};
 use palpate_haptics::{ContactLoad, InstrumentContact, InstrumentPose, PortLoad};
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
 /// ([`made_for`](super::script_reader::made_for)).
-pub const BUILT_IN: [(&str, &str); 10] = [
+pub const BUILT_IN: [(&str, &str); 11] = [
     ("cut", include_str!("../../../../scripts/cut.toml")),
     ("cut-solid", include_str!("../../../../scripts/cut-solid.toml")),
     ("grasp", include_str!("../../../../scripts/grasp.toml")),
@@ -24,6 +24,7 @@ pub const BUILT_IN: [(&str, &str); 10] = [
     ("press", include_str!("../../../../scripts/press.toml")),
     ("push", include_str!("../../../../scripts/push.toml")),
     ("stroke", include_str!("../../../../scripts/stroke.toml")),
+    ("suture", include_str!("../../../../scripts/suture.toml")),
     ("vertical-60", include_str!("../../../../scripts/vertical-60.toml")),
 ];
 
@@ -65,6 +66,8 @@ pub struct Script {
     pub poses: Vec<PoseProfile>,
     /// Instruments, in the order of the text. Their tips are tools of `poses`.
     pub instruments: Vec<Arc<InstrumentProfile>>,
+    /// Threads, then clips, in the order of the text: number k is entry k. The tool after the others lays them.
+    pub ties: Vec<TieProfile>,
     /// Changes of the tissue, each with the step at whose beginning it takes effect, by strictly ascending
     /// step.
     pub changes: Vec<(u64, Change)>,
@@ -115,7 +118,7 @@ impl Script {
         let place_m = move |profile: &PoseProfile, end: u64| {
             profile.at(end as f64 / self.rate_hz).filter(|place_m| is_led(profile, place_m))
         };
-        self.poses.iter().enumerate().filter_map(move |(index, profile)| {
+        let poses = self.poses.iter().enumerate().filter_map(move |(index, profile)| {
             let action = match place_m(profile, step + 1) {
                 Some(place_m) => {
                     let tip = profile.tip_at((step + 1) as f64 / self.rate_hz);
@@ -124,7 +127,23 @@ impl Script {
                 None => place_m(profile, step).map(|_| Action::Release)?,
             };
             Some((first + index, action))
+        });
+        poses.chain(self.ties_at(step))
+    }
+
+    /// Returns what lays, changes and cuts threads and clips at step `step`.
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
+    fn ties_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
+        let at = move |profile: &TieProfile, end: u64| profile.at(end as f64 / self.rate_hz);
+        self.ties.iter().enumerate().filter_map(move |(number, profile)| {
+            let (before, tie) = (at(profile, step).filter(|_| step > 0), at(profile, step + 1));
+            (before != tie).then(|| (self.tool_count(), Action::Tie { number: number as u32, tie }))
         })
+    }
+
+    /// Returns the number of tools that act by themselves, without the one that lays threads and clips.
+    fn tool_count(&self) -> usize {
+        self.forces.len() + self.moves.len() + self.poses.len()
     }
 
     /// Returns the number of the first tool with a tip; `None` if the script has none.
@@ -186,6 +205,6 @@ impl Script {
 
     /// Returns the number of tools that the script uses: theirs are 0 to this − 1.
     pub fn tools(&self) -> usize {
-        self.forces.len() + self.moves.len() + self.poses.len()
+        self.tool_count() + usize::from(!self.ties.is_empty())
     }
 }

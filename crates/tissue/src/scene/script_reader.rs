@@ -14,13 +14,14 @@ use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, Inst
 use super::kind::TextKind;
 use super::profile::{
     CentreProfile, InstrumentProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile,
-    weights,
+    TieProfile, weights,
 };
 use super::script::Script;
 use super::{Change, Scene};
 use crate::files;
 use crate::limits::Limits;
 use crate::scene::action_check::{check_force, check_free, check_reach, check_tip};
+use crate::scene::tie::{Bite, Tie, TieKind, check_tie};
 use crate::scene::toml_document::{Document, Fields, Item};
 use crate::shape::{self, PointId};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, legible, not_negative, number, positive, unsigned_zero};
@@ -127,6 +128,7 @@ impl Binding<'_> {
             poses.extend((0..profile.instrument.tips.len()).map(|tip| mounted(&profile, tip)));
             instruments.push(profile);
         }
+        let ties = self.ties(fields)?;
         control_points.extend(moves.iter().map(|profile| profile.point));
         // A row of tips would make many.
         let of_tools = poses.iter().filter(|profile: &&PoseProfile| profile.mounted.is_none());
@@ -140,11 +142,11 @@ impl Binding<'_> {
             }
         }
         let changes = self.changes(&items(fields, "tissue")?)?;
-        let tools = forces.len() + moves.len() + poses.len();
+        let tools = forces.len() + moves.len() + poses.len() + usize::from(!ties.is_empty());
         if tools > self.limits.tools as usize {
             let message = format!(
-                "a script uses {tools} tools (one for each [[force]], each [[tool]] and each tip of an [[instrument]]), above the \
-                 limit of {}",
+                "a script uses {tools} tools (one for each [[force]], each [[tool]] and each tip of an [[instrument]], and one for all \
+                 threads and clips), above the limit of {}",
                 self.limits.tools
             );
             return Err(Refusal::new(Reason::TooLarge, "force", message));
@@ -165,6 +167,7 @@ impl Binding<'_> {
             moves,
             poses,
             instruments,
+            ties,
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
@@ -586,6 +589,87 @@ impl Binding<'_> {
         Ok(instrument)
     }
 
+    /// Reads the threads and then the clips.
+    fn ties(&mut self, fields: &mut Fields<'_>) -> Result<Vec<TieProfile>> {
+        let mut ties = Vec::new();
+        for item in items(fields, "thread")? {
+            ties.push(item.table(|fields| self.thread(fields))?);
+        }
+        for item in items(fields, "clip")? {
+            ties.push(item.table(|fields| {
+                let from_s = not_negative(&fields.path("from_s"), fields.number("from_s")?.unwrap_or(0.0))?;
+                self.tie(fields, TieKind::Clip, vec![(from_s, 0.0)])
+            })?);
+        }
+        if ties.len() > self.limits.ties as usize {
+            let message = format!("{} threads and clips: above the limit of {}", ties.len(), self.limits.ties);
+            return Err(Refusal::new(Reason::TooLarge, "thread", message));
+        }
+        Ok(ties)
+    }
+
+    /// Reads a thread, whose length is a number or a list of lengths over time.
+    fn thread(&mut self, fields: &mut Fields<'_>) -> Result<TieProfile> {
+        let friction = fields.number("friction")?.unwrap_or(0.0);
+        let length = fields.required("length_m")?;
+        let lengths_m = if let Ok(list) = length.list() {
+            if fields.item("from_s").is_some() {
+                let message = "is for a thread of one length: in a list, the first at_s says when it is laid";
+                return Err(fields.refuse(Reason::WrongKind, "from_s", message));
+            }
+            let mut lengths_m: Vec<(f64, f64)> = Vec::new();
+            for entry in list {
+                lengths_m.push(entry.table(|fields| {
+                    let at_s = later(fields, lengths_m.last().map(|length| length.0))?;
+                    Ok((at_s, positive(&fields.path("length_m"), fields.required_number("length_m")?)?))
+                })?);
+            }
+            lengths_m
+        } else {
+            let from_s = not_negative(&fields.path("from_s"), fields.number("from_s")?.unwrap_or(0.0))?;
+            vec![(from_s, fields.required_number("length_m")?)]
+        };
+        let Some((_, length_m)) = lengths_m.first().copied() else {
+            return Err(length.refuse(Reason::Missing, "must have at least one length"));
+        };
+        self.tie(fields, TieKind::Thread { length_m, friction }, lengths_m)
+    }
+
+    /// Reads what threads and clips have in common.
+    fn tie(&mut self, fields: &mut Fields<'_>, kind: TieKind, lengths_m: Vec<(f64, f64)>) -> Result<TieProfile> {
+        let shape = self.scene.shape();
+        let name = fields.text("name")?.unwrap_or_default();
+        let mut bites = Vec::new();
+        for entry in fields.required("bites")?.list()? {
+            bites.push(entry.table(|fields| {
+                let place_m = shape.in_rest_space_m(fields.required("place_m")?.vector()?);
+                let radius_m = fields.number("radius_m")?.unwrap_or(BITE_RADIUS_M);
+                if shape.is_fixed(shape.nearest(place_m)) {
+                    let message = "is at a fixed point: what is tied there does not move";
+                    self.warnings.push(format!("{}: {message}", fields.path("place_m")));
+                }
+                Ok(Bite { place_m, radius_m })
+            })?);
+        }
+        let tie = Tie { bites, kind, strength_n: fields.number("strength_n")? };
+        let until_s = fields.number("until_s")?.unwrap_or(f64::INFINITY);
+        if lengths_m.first().is_some_and(|first| until_s <= first.0) {
+            return Err(fields.refuse(
+                Reason::OutOfRange,
+                "until_s",
+                "must be later than the time at which it is laid",
+            ));
+        }
+        for (_, length_m) in &lengths_m {
+            let kind = match kind {
+                TieKind::Thread { friction, .. } => TieKind::Thread { length_m: *length_m, friction },
+                TieKind::Clip => TieKind::Clip,
+            };
+            check_tie(fields.own_path(), shape, &Tie { kind, ..tie.clone() }, self.limits)?;
+        }
+        Ok(TieProfile { name, tie, lengths_m, until_s })
+    }
+
     /// Reads a tool with a tip.
     fn poses(&mut self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
         let shape = self.scene.shape();
@@ -688,6 +772,9 @@ fn until(fields: &mut Fields<'_>, list: &Item<'_>, begin_s: Option<f64>) -> Resu
 
 /// Radius of the part of the surface that a blade feels, m, if a script gives none.
 const BLADE_RADIUS_M: f64 = 0.001;
+
+/// Radius of the disc of a bite, m, if a script gives none.
+const BITE_RADIUS_M: f64 = 0.001;
 
 /// Reads a blade. Its edge runs from the tip along the instrument's −x.
 fn blade_of(item: &Item<'_>, shape: &dyn shape::RestShape) -> Result<Tip> {

@@ -11,11 +11,23 @@ use palpate_haptics::{Coupling, Tip};
 
 use super::profile::Poke;
 use super::script::Action;
+use super::tie::{Bite, Tie, TieKind};
 use super::{Cutting, Scene, Springs};
 use palpate_refusal::unsigned_zero;
 
 fn unsigned(v: DVec3) -> DVec3 {
     v + DVec3::ZERO
+}
+
+/// Returns a thread or clip with every −0 replaced by 0. Its radii, length and strength are above 0.
+fn unsigned_tie(tie: Tie) -> Tie {
+    let Tie { bites, kind, strength_n } = tie;
+    let bites = bites.into_iter().map(|bite| Bite { place_m: unsigned(bite.place_m), ..bite });
+    let kind = match kind {
+        TieKind::Thread { length_m, friction } => TieKind::Thread { length_m, friction: unsigned_zero(friction) },
+        TieKind::Clip => TieKind::Clip,
+    };
+    Tie { bites: bites.collect(), kind, strength_n }
 }
 
 impl Scene {
@@ -36,7 +48,7 @@ impl Scene {
             stepping,
             sleep_tolerance,
             appearance,
-            cutting: Cutting { toughness_j_per_m2, thickness_m },
+            cutting: Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m },
         } = self;
         Scene {
             name,
@@ -58,6 +70,8 @@ impl Scene {
             cutting: Cutting {
                 toughness_j_per_m2: unsigned_zero(toughness_j_per_m2),
                 thickness_m: thickness_m.map(unsigned_zero),
+                tear_strain,
+                tear_reference_m,
             },
         }
     }
@@ -91,6 +105,7 @@ impl Action {
                 let velocity_m_per_s = velocity_m_per_s.map(unsigned);
                 Action::Pose { place_m: unsigned(place_m), velocity_m_per_s, tip }
             }
+            Action::Tie { number, tie } => Action::Tie { number, tie: tie.map(unsigned_tie) },
             Action::Release => Action::Release,
         }
     }

@@ -1,4 +1,4 @@
-//! Blades: what their edges sever in a step.
+//! What is severed in a step: by the edges of blades, and by strain (`tearing`).
 //!
 //! In a step the edge of a blade sweeps a surface, from the line between its tip and its heel at the step's beginning to that at
 //! the step's end: two triangles. A spring that crosses one of them is severed. The tissue moves as well, so the edge
@@ -100,17 +100,20 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// Severs the springs that blades cross in this step.
+    /// Severs the springs that blades cross in this step, and those that tear.
     pub(super) fn cut(&mut self) {
         let blades = self.contacts.tools.iter().filter(|tool| tool.tip.shape == TipShape::Blade);
         let sweeps: Vec<EdgeSweep> = blades.map(EdgeSweep::of).collect();
-        if sweeps.is_empty() {
+        if sweeps.is_empty() && self.model.scene.cutting.tear_strain.is_none() {
             return;
         }
-        self.prepare_to_cut();
+        if !sweeps.is_empty() {
+            self.prepare_to_cut();
+        }
         let crossed =
             |sweep| if self.model.places.solid().is_some() { self.crossed_faces(sweep) } else { self.crossed(sweep) };
         let mut crossings: Vec<Crossing> = sweeps.iter().flat_map(crossed).collect();
+        crossings.extend(self.torn());
         crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
         crossings.dedup_by_key(|crossing| (crossing.place, crossing.spring.number));
         if crossings.is_empty() {
@@ -273,5 +276,6 @@ impl<T: Real> TissueState<T> {
 }
 
 mod faces;
+mod tearing;
 #[cfg(test)]
 mod tests;

@@ -46,6 +46,7 @@ use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::Prescribed;
+use crate::tools::tie::Ties;
 use palpate_haptics::TipShape;
 
 /// By which part of what the loads of severed springs have done an energy may rise: just after a cut a scheme's error is a part of little.
@@ -268,6 +269,11 @@ impl<T: Real> TissueState<T> {
                     self.prepare_to_cut();
                 }
             }
+            ToolInput::Tie(tie) => {
+                let TissueState { model, tables, state, contacts, .. } = self;
+                contacts
+                    .tie(model, tool, tie.map(|tie| *tie), |point| displacement_m(model, &tables.layout, state, point));
+            }
             ToolInput::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
                 self.contacts.release(tool);
@@ -344,6 +350,8 @@ impl<T: Real> TissueState<T> {
             self.state = State::at_rest(&self.tables.layout, self.state.kept.len());
             (self.applied, self.prescribed, self.contacts) = (Applied::new(), Prescribed::new(), Contacts::default());
         }
+        // They may be what the tissue did not bear.
+        self.contacts.ties = Ties::default();
         // The largest displacement of the failed attempts must not decide what may sleep.
         if let Some(checkpoint) = &self.checkpoint {
             self.tiles.largest = checkpoint.largest;

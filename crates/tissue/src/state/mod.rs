@@ -15,3 +15,4 @@ pub(crate) mod step_context;
 #[cfg(test)]
 mod subnormal;
 pub(crate) mod tissue_state;
+mod tying;

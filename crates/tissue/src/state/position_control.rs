@@ -110,13 +110,14 @@ impl Contacts {
         }
     }
 
-    /// Returns the energy of spring couplings, J.
+    /// Returns the energy of spring couplings, and of the stretch of threads, J.
     pub(crate) fn coupling_j<T: Real>(&self, model: &Model, layout: &Layout, state: &State<T>) -> f64 {
         let stored_j = |tool: &Tool| {
             let (surface_m, _) = tool.footprint.surface(|point| displacement_m(model, layout, state, point));
             tool.stored_j(surface_m, tool.from_m)
         };
-        self.tools.iter().filter(|tool| tool.is_coupled()).map(stored_j).sum()
+        let tools_j: f64 = self.tools.iter().filter(|tool| tool.is_coupled()).map(stored_j).sum();
+        if self.ties.is_empty() { tools_j } else { tools_j + self.ties.stored_j() }
     }
 
     /// Returns the tool with a number; `None` if that is not a position-controlled one.

@@ -17,8 +17,8 @@ use crate::kernel::region::sides_of;
 use crate::limits::Limits;
 use crate::memory;
 use crate::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedPrescribed, SavedState,
-    TissueParts, ensure, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedInput, SavedPrescribed, SavedState,
+    SavedTie, SavedTies, TissueParts, ensure, unsound,
 };
 use crate::scene::{Named, Precision};
 use crate::state::guard::checkpoint::Checkpoint;
@@ -110,6 +110,10 @@ impl Model {
         ] {
             add(&value.to_bits().to_le_bytes());
         }
+        // A tissue that does not tear keeps the hash that it had before any could.
+        for value in [scene.cutting.tear_strain, scene.cutting.tear_reference_m].into_iter().flatten() {
+            add(&value.to_bits().to_le_bytes());
+        }
         add(&[u8::from(scene.springs.bending)]);
         add(self.plan.integrator.name().as_bytes());
         add(&self.plan.substeps.to_le_bytes());
@@ -130,6 +134,7 @@ pub(super) struct TypedState<T: Real> {
     pub(super) forces: SavedForces,
     pub(super) prescribed: SavedPrescribed,
     pub(super) contacts: Vec<SavedContact>,
+    pub(super) ties: Vec<SavedTie>,
     pub(super) work: WorkAccount,
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     pub(super) inputs: Vec<(u64, usize, ToolInput)>,
@@ -185,6 +190,10 @@ impl<T: Real> SavedState for TypedState<T> {
             guard_events: self.guard_events,
             substeps_done: self.substeps_done,
             points_done: self.points_done,
+            ties: SavedTies {
+                now: self.ties.clone(),
+                at_checkpoint: self.checkpoint.as_ref().map_or_else(Vec::new, |from| from.contacts.ties.saved()),
+            },
         };
         PlainTissue { parts, values }
     }
@@ -230,7 +239,7 @@ fn restored_as<T: Real>(
     let scale = sheet.plan.force_scale(&model.scene);
     sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
     sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
-    sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
+    sheet.contacts = Contacts::restored((&parts.contacts, &parts.ties.now), model, &checks)?;
     sheet.work = WorkAccount::restored(&parts.work)?;
     sheet.tiles.restore(&parts.tiles)?;
     let cuts = Cuts::restored(&parts.severed, parts.topology_version, model)?;
@@ -268,7 +277,7 @@ fn restored_as<T: Real>(
     let checkpoint = parts.checkpoint.as_ref().map(|saved| {
         let mut state = State::zero(&layout, sheet.state.kept.len());
         fill(&mut state)?;
-        checkpoint_of(&sheet, saved, state, &checks)
+        checkpoint_of(&sheet, (saved, &parts.ties.at_checkpoint), state, &checks)
     });
     sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
     sheet.tiles.remember_again(&mut values)?;
@@ -277,7 +286,8 @@ fn restored_as<T: Real>(
     let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
     for (step, tool, input) in &parts.inputs {
         ensure((from..=sheet.steps).contains(step), "an input at a step before its checkpoint or after its end")?;
-        sheet.inputs.push((*step, checks.tool(*tool)?, ToolInput::restored(input, model, &checks)?));
+        let number = if matches!(input, SavedInput::Tie(_)) { checks.tie(*tool)? } else { checks.tool(*tool)? };
+        sheet.inputs.push((*step, number, ToolInput::restored(input, model, &checks)?));
     }
     ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;
     if sheet.checkpoint.is_none() {
@@ -291,7 +301,7 @@ fn restored_as<T: Real>(
 
 fn checkpoint_of<T: Real>(
     tissue: &TissueState<T>,
-    saved: &SavedCheckpoint,
+    (saved, ties): (&SavedCheckpoint, &[SavedTie]),
     state: State<T>,
     checks: &Checks<'_>,
 ) -> Result<Checkpoint<T>> {
@@ -304,7 +314,7 @@ fn checkpoint_of<T: Real>(
     ensure(severed <= tissue.tables.severed.len(), "more severed springs in its checkpoint than now")?;
     let scale = halved(model, saved.halvings).force_scale(&model.scene);
     let cuts = tissue.tables.severed.first(severed, model);
-    let mut contacts = Contacts::restored(&saved.contacts, model, checks)?;
+    let mut contacts = Contacts::restored((&saved.contacts, ties), model, checks)?;
     let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
     contacts.follow_cuts(model, cuts.copies());
     if cuts.copies().is_some() {

@@ -37,6 +37,7 @@ impl<T: Real> TissueState<T> {
             self.sweep(substep);
             self.hold(substep);
             self.touch(substep);
+            self.tie(substep, self.plan.substeps - 1 - number);
         }
         self.cut();
         self.end_step();
@@ -147,10 +148,20 @@ impl<T: Real> TissueState<T> {
         self.ended(StepStage::Contact);
     }
 
+    /// Lets threads and clips pull at the end of a substep that is followed by `more` in this step (`tools::tie`).
+    fn tie(&mut self, substep: Substep, more: u32) {
+        if !self.contacts.ties.is_empty() {
+            let (mut context, _, contacts) = self.parts();
+            contacts.ties.act(&mut context, more, substep.far);
+            self.ended(StepStage::Contact);
+        }
+    }
+
     fn end_step(&mut self) {
         self.applied.finish(&self.model, self.steps);
         self.prescribed.finish(&self.model, self.steps);
         self.contacts.finish(self.model.scene.stepping.rate_hz);
+        self.contacts.ties.finish(self.plan.substeps);
         self.steps += 1;
     }
 

@@ -23,6 +23,7 @@ use crate::response::around_place::reaction_around;
 use crate::saved::SavedTissue;
 use crate::scene::Precision;
 use crate::scene::profile::Poke;
+use crate::scene::tie::Tie;
 use crate::scheme::observer::Observer;
 use crate::shape::PointId;
 use crate::stage_times::{StageTimes, StepStage};
@@ -36,6 +37,7 @@ use crate::tools::applied_force::{Applied, Push};
 use crate::tools::contact::{Contacts, TangentInput, ToolContact};
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::{Grasp, Prescribed};
+use crate::tools::tie::TieState;
 use palpate_haptics::{ContactState, Tip};
 
 /// Creates a tissue at rest, at step 0 and without tools, in the number format of the model: f64 for
@@ -137,7 +139,7 @@ impl<T: Real> TissueState<T> {
         self.tiles.region.tiles().is_empty()
             && self.applied.is_settled()
             && self.prescribed.is_empty()
-            && self.contacts.is_empty()
+            && self.contacts.are_settled()
     }
 
     /// Passes steps in which nothing moves.
@@ -237,6 +239,14 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
         self.input(tool, ToolInput::Pose(place_m, tip));
+    }
+
+    fn tie(&mut self, number: usize, tie: Option<Tie>) {
+        self.input(number, ToolInput::Tie(tie.map(Box::new)));
+    }
+
+    fn ties(&self) -> Vec<TieState> {
+        self.contacts.ties.states(|point| self.displacement_m(point))
     }
 
     fn tool_contact(&self, tool: usize) -> Option<ToolContact> {
@@ -406,6 +416,7 @@ impl<T: Real> Tissue for TissueState<T> {
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
         if blocks.start == 0 {
             self.tables.severed.hash(hasher);
+            self.contacts.ties.hash(&mut |bytes| hasher.update(bytes));
         }
         self.state.hash_blocks(&self.tables.layout, |point| self.tiles.has_moved(point), blocks, hasher);
     }

@@ -59,8 +59,10 @@ use crate::body::window::Window;
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
 use crate::response::tangent::{LinearPatch, Tangent};
-use crate::saved::{Checks, SavedContact, SavedSide, SavedTip, ensure};
+use crate::saved::{Checks, SavedContact, SavedSide, SavedTie, SavedTip, ensure};
+use crate::scene::tie::Tie;
 use crate::tools::rigid_tip::RigidTip;
+use crate::tools::tie::Ties;
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_refusal::Result;
 
@@ -171,11 +173,12 @@ fn rigid_tip(tip: Tip) -> Option<RigidTip> {
     tip.shape.is_rigid().then(|| RigidTip::new(tip))
 }
 
-/// All position-controlled tools.
+/// All position-controlled tools, and the threads and clips, which hold discs as they do.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Contacts {
     /// By ascending number.
     pub(crate) tools: Vec<Tool>,
+    pub(crate) ties: Ties,
     /// The corners of a solid that cuts have doubled.
     copies: Option<Arc<CornerCopies>>,
 }
@@ -227,13 +230,28 @@ impl Contacts {
         self.tools.iter().map(Tool::saved).collect()
     }
 
-    pub(crate) fn restored(saved: &[SavedContact], model: &Model, checks: &Checks<'_>) -> Result<Self> {
+    pub(crate) fn restored(
+        (saved, ties): (&[SavedContact], &[SavedTie]),
+        model: &Model,
+        checks: &Checks<'_>,
+    ) -> Result<Self> {
         let tools: Vec<Tool> = saved.iter().map(|tool| Tool::restored(tool, model, checks)).collect::<Result<_>>()?;
         ensure(tools.is_sorted_by(|a, b| a.number < b.number), "tools out of order")?;
-        Ok(Contacts { tools, copies: None })
+        Ok(Contacts { tools, ties: Ties::restored(ties, model, checks)?, copies: None })
     }
 
-    /// Lets all tools move with these copies of a solid's corners; `None` gives up those that they have.
+    /// Lays, changes or with `None` removes a thread or clip ([`Ties::set`]).
+    pub(crate) fn tie(
+        &mut self,
+        model: &Model,
+        number: usize,
+        tie: Option<Tie>,
+        displacement_m: impl Fn([usize; 2]) -> DVec3,
+    ) {
+        self.ties.set(model, number, tie, self.copies.as_ref(), displacement_m);
+    }
+
+    /// Lets all tools, threads and clips move with these copies of a solid's corners; `None` gives up those that they have.
     pub(crate) fn follow_cuts(&mut self, model: &Model, copies: Option<&Arc<CornerCopies>>) {
         self.copies = copies.cloned();
         for tool in &mut self.tools {
@@ -242,15 +260,24 @@ impl Contacts {
                 rigid.follow_cuts(model, &tool.footprint);
             }
         }
+        if let Some(copies) = copies {
+            self.ties.follow_cuts(model, copies);
+        }
     }
 
+    /// Returns whether there are neither tools nor threads and clips.
     pub(crate) fn is_empty(&self) -> bool {
-        self.tools.is_empty()
+        self.tools.is_empty() && self.ties.is_empty()
     }
 
-    /// Returns whether none of these tools touches or holds the tissue.
+    /// Returns whether there are no tools, and threads and clips that do nothing to a tissue at rest.
+    pub(crate) fn are_settled(&self) -> bool {
+        self.tools.is_empty() && self.ties.are_settled()
+    }
+
+    /// Returns whether none of these tools touches or holds the tissue, and no thread or clip pulls.
     pub(crate) fn are_free(&self) -> bool {
-        self.tools.iter().all(|tool| tool.contact_state == ContactState::Free)
+        self.tools.iter().all(|tool| tool.contact_state == ContactState::Free) && self.ties.points().next().is_none()
     }
 
     /// Returns the numbers of these tools.
@@ -258,19 +285,21 @@ impl Contacts {
         self.tools.iter().map(|tool| tool.number)
     }
 
-    /// Returns the points under tools that touch or hold. Some occur more than once.
+    /// Returns the points under tools that touch or hold, and under threads and clips that pull. Some occur more than once.
     pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
-        self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::moved_points)
+        let touching = self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free);
+        touching.flat_map(Tool::moved_points).chain(self.ties.points())
     }
 
-    /// Returns the continuing force of these tools on a point, N.
+    /// Returns the continuing force of these tools, threads and clips on a point, N.
     pub(crate) fn steady_on(&self, model: &Model, index: usize) -> DVec3 {
         let pressing = self.tools.iter().filter(|tool| tool.steady_n != DVec3::ZERO);
         let of = |tool: &Tool| match &tool.rigid {
             Some(rigid) => rigid.steady_on(index),
             None => tool.footprint.weight_of(model, index) * tool.steady_n,
         };
-        pressing.map(of).sum()
+        let pressing_n: DVec3 = pressing.map(of).sum();
+        if self.ties.is_empty() { pressing_n } else { pressing_n + self.ties.force_on(model, index) }
     }
 
     pub(crate) fn release(&mut self, number: usize) {

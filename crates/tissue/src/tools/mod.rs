@@ -1,4 +1,5 @@
-//! What tools do to a tissue: forces, prescribed displacements, and contact of a tip's disc (`contact`) or of a rigid tip.
+//! What tools do to a tissue: forces, prescribed displacements, contact of a tip's disc (`contact`) or of a rigid tip, and what threads
+//! and clips hold (`tie`).
 
 pub(crate) mod applied_force;
 pub(crate) mod blade;
@@ -6,3 +7,4 @@ pub(crate) mod contact;
 pub(crate) mod input;
 pub(crate) mod prescribed;
 pub(crate) mod rigid_tip;
+pub(crate) mod tie;

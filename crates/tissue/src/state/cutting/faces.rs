@@ -102,6 +102,16 @@ impl<T: Real> TissueState<T> {
         }
     }
 
+    /// Returns the displacement of the end of a spring and its way in this step, m: in a solid of the middle of a cube.
+    pub(super) fn end_motion_m(&self, place: usize) -> [DVec3; 2] {
+        let TissueState { model, plan, state, .. } = self;
+        if let Some(places) = model.places.solid() {
+            return self.middle_motion_m(places, place);
+        }
+        let substeps = f64::from(plan.substeps);
+        [model.unit_m * self.vector(&state.u, place), model.unit_m * substeps * self.vector(&state.d, place)]
+    }
+
     /// Returns the displacement of the middle of a cube and its way in this step, m.
     fn middle_motion_m(&self, places: &SolidPlaces, cube: usize) -> [DVec3; 2] {
         let TissueState { model, plan, tables, state, .. } = self;

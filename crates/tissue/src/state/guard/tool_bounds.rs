@@ -46,5 +46,6 @@ pub(crate) fn broken_by_tools<T: Real>(
         if tool.contact_state == ContactState::Free { None } else { points.find(|index| !is_good(index)) }
     };
     let grasped = prescribed.grasped().map(|(index, _)| index).find(|index| !is_good(index));
-    grasped.or_else(|| contacts.tools.iter().find_map(of_tool))
+    let of_tools = || contacts.tools.iter().find_map(of_tool);
+    grasped.or_else(of_tools).or_else(|| contacts.ties.broken_point(model, |index| is_good(&index)))
 }
