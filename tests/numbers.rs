@@ -250,6 +250,7 @@ fn commands() -> Vec<pb::Command> {
     use pb::command::Action as Message;
     let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
     let grid = || Some(pb::GridPoint { x: 4, y: 3 });
+    let bite = |x| pb::Bite { place_m: vector(x, 0.15, 0.0), radius_m: 0.05 };
     let force = |centre| {
         let (falloff_per_m, falloff_offset) = (Some(20.0), Some(0.1));
         Message::Force(pb::Force {
@@ -286,6 +287,19 @@ fn commands() -> Vec<pb::Command> {
         position(pb::position::Target::PositionM(pb::Vector3 { x: 0.2, y: 0.15, z: 1e-3 })),
         Message::Pose(pose),
         Message::Pose(grasping),
+        Message::Tie(pb::Tie {
+            number: 1,
+            kind: Some(pb::tie::Kind::Thread(pb::Thread {
+                bites: vec![bite(0.15), bite(0.25)],
+                length_m: 0.09,
+                friction: 0.1,
+                strength_n: Some(50.0),
+            })),
+        }),
+        Message::Tie(pb::Tie {
+            number: 0,
+            kind: Some(pb::tie::Kind::Clip(pb::Clip { bites: vec![bite(0.2), bite(0.22)], strength_n: None })),
+        }),
     ];
     actions
         .into_iter()
@@ -301,7 +315,9 @@ fn every_number_of_a_command_gives_the_same_bits_on_every_way_or_is_refused() {
     let models = ["f32", "f64"].map(|precision| Model::compile(&sheet(precision, &[]), &limits()).unwrap());
     let saved = models.each_ref().map(|model| Saved::from_bytes(&begun(model).save().to_bytes(), &limits()).unwrap());
     let (mut taken, mut refused) = (0, 0);
-    for (message, number) in commands().into_iter().flat_map(|message| numbers.iter().map(move |n| (message, n))) {
+    for (message, number) in
+        commands().into_iter().flat_map(|message| numbers.iter().map(move |n| (message.clone(), n)))
+    {
         for (value, which) in NUMBERS.into_iter().zip([0, 1].into_iter().cycle()) {
             let about = format!("{} = {value:e} in {message:?}", number.name);
             let bytes = [message.encode_to_vec(), number.set_to(value)].concat();

@@ -12,6 +12,8 @@ use glam::DVec3;
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};
 use palpate_session::run::{RunOptions, run};
+use palpate_session::simulation::Simulation;
+use palpate_session::snapshot::Saved;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
@@ -383,4 +385,96 @@ fn the_surface_under_a_tip_is_deeper_than_the_mean_over_it() {
     };
     assert!((at(14.5, 15.0) - 0.5 * (at(14.0, 15.0) + at(15.0, 15.0))).length() < 1e-12);
     assert_eq!(at(-3.0, 15.0), at(0.0, 15.0));
+}
+
+#[test]
+fn three_stitches_close_a_wound_while_its_lips_are_drawn_apart() {
+    let scene = built_in("liver", &[]);
+    let (model, sutured) = (model(&scene), shipped("suture", &scene));
+    let mut open = sutured.clone();
+    open.ties.clear();
+    let opening_m = |script: &Script| {
+        let limits = Limits::default();
+        let mut simulation = Simulation::playing(&model, script, false, &limits).unwrap();
+        simulation.run_to(script.steps).unwrap();
+        let at = |x: f64| simulation.session.tissue().surface_displacement_m(DVec3::new(x, 0.0375, 0.0)).x;
+        at(0.0375) - at(0.035)
+    };
+    let (with_m, without_m) = (opening_m(&sutured), opening_m(&open));
+    assert!(without_m > 5e-4 && with_m < 0.3 * without_m, "{with_m} {without_m} m");
+    let (records, summary) = run_whole(&model, &sutured, false);
+    assert!(summary.ties.len() == 3 && summary.guard_events == 0, "{summary:?}");
+    for (tie, name) in summary.ties.iter().zip(["lower", "middle", "upper"]) {
+        assert!(tie.name == name && !tie.is_broken && tie.peak_tension_n > 0.02, "{tie:?}");
+        assert!((tie.path_m / 0.008 - 1.0).abs() < 0.01 && (tie.length_m - 0.008).abs() < 1e-9, "{tie:?}");
+    }
+    let opened_m = summary.ties[1].path_when_laid_m - 0.008;
+    assert!(opened_m > 5e-4, "{opened_m}");
+    let told = &records.last().unwrap()["summary"]["ties"];
+    assert_eq!(told.as_array().unwrap().len(), 3, "{told}");
+}
+
+#[test]
+fn what_is_wrong_with_a_thread_or_a_clip_is_named() {
+    let scene = built_in("liver", &[]);
+    let bites = "bites = [{ place_m = [0.03, 0.03, 0] }, { place_m = [0.04, 0.03, 0] }]";
+    let thread = |lines: &str| format!("[[thread]]\n{lines}\n");
+    let clip = |lines: &str| format!("[[clip]]\n{lines}\n");
+    for (text, expected) in [
+        (thread(bites), "thread[0].length_m: is missing"),
+        (thread("length_m = 0.01"), "thread[0].bites: is missing"),
+        (thread("length_m = 0.01\nbites = [{ place_m = [0.03, 0.03, 0] }]"), "thread[0].bites: has 1 bites"),
+        (thread(&format!("{bites}\nlength_m = -0.01")), "thread[0].length_m"),
+        (thread(&format!("{bites}\nlength_m = []")), "thread[0].length_m: must have at least one"),
+        (
+            thread(&format!(
+                "{bites}\nlength_m = [{{ at_s = 0.1, length_m = 0.01 }}, {{ at_s = 0.1, length_m = 0.02 }}]"
+            )),
+            "thread[0].length_m[1].at_s: must be later",
+        ),
+        (
+            thread(&format!("{bites}\nlength_m = [{{ at_s = 0.1, length_m = 0.01 }}]\nfrom_s = 0.1")),
+            "thread[0].from_s: is for a thread of one length",
+        ),
+        (thread(&format!("{bites}\nlength_m = 0.01\nfriction = 11.0")), "thread[0].friction"),
+        (thread(&format!("{bites}\nlength_m = 0.01\nstrength_n = 0.0")), "thread[0].strength_n"),
+        (thread(&format!("{bites}\nlength_m = 0.01\nuntil_s = 0.0")), "thread[0].until_s: must be later"),
+        (
+            clip("bites = [{ place_m = [0.3, 0.03, 0] }, { place_m = [0.04, 0.03, 0] }]"),
+            "clip[0].bites[0].place_m: (0.3",
+        ),
+        (clip(&format!("{bites}\nlength_m = 0.01")), "clip[0].length_m"),
+        (
+            clip("bites = [{ place_m = [0.03, 0.03, 0], radius_m = -1.0 }, { place_m = [0.04, 0.03, 0] }]"),
+            "clip[0].bites[0].radius_m",
+        ),
+    ] {
+        let text = format!("duration_s = 0.1\nsample_every_s = 0.1\n{text}");
+        let refusal = Script::parse("s", &text, Path::new(""), &scene, &Limits::default()).unwrap_err().to_string();
+        assert!(refusal.contains(expected), "{refusal}\nexpected: {expected}");
+    }
+    let text = "duration_s = 0.1\nsample_every_s = 0.1\n[[clip]]\nbites = [{ place_m = [0, 0.03, 0] }, { place_m = [0.01, 0.03, 0] }]\n";
+    let warnings = script(text, &scene).warnings;
+    assert!(warnings.len() == 1 && warnings[0].contains("place_m: is at a fixed point"), "{warnings:?}");
+}
+
+#[test]
+fn a_thread_is_part_of_a_snapshot_and_of_a_continued_session() {
+    let scene = built_in("liver", &[]);
+    let (model, sutured, limits) = (model(&scene), shipped("suture", &scene), Limits::default());
+    let mut simulation = Simulation::playing(&model, &sutured, true, &limits).unwrap();
+    simulation.run_to(2700).unwrap();
+    let bytes = simulation.session.save().to_bytes();
+    let saved = Saved::from_bytes(&bytes, &limits).unwrap();
+    let mut again = Session::restore(&model, &saved).unwrap();
+    assert_eq!(again.save().to_bytes(), bytes);
+    assert_eq!((again.tissue().ties().len(), again.tissue().ties()), (2, simulation.session.tissue().ties()));
+    for step in 2700..3200 {
+        let due = sutured
+            .actions_at(step)
+            .map(|(tool, action)| Due::in_time(Command::new(tool as u32, Some(step + 1), action)));
+        again.advance(&mut due.collect::<Vec<_>>(), |_| {});
+        simulation.step(0).unwrap();
+    }
+    assert_eq!(again.tissue().state_hash(), simulation.session.tissue().state_hash());
 }

@@ -340,16 +340,20 @@ fn request_seeds() -> Vec<Vec<u8>> {
         orientation: DQuat::IDENTITY,
         jaw_rad: 0.4,
     }));
-    let actions = [force, position, pose, grasper_pose, pb::command::Action::Release(pb::Release {})];
+    let bite = |x| pb::Bite { place_m: vector(x, 0.05, 0.0), radius_m: 0.02 };
+    let thread =
+        pb::Thread { bites: vec![bite(0.05), bite(0.1)], length_m: 0.04, friction: 0.1, strength_n: Some(5.0) };
+    let tie = pb::command::Action::Tie(pb::Tie { number: 1, kind: Some(pb::tie::Kind::Thread(thread)) });
+    let actions = [force, position, pose, grasper_pose, pb::command::Action::Release(pb::Release {}), tie];
     let command = |index: usize| pb::Command {
         tool: index as u32 % 3,
         sequence: Some(index as u64 + 1),
         client_time_ns: index as u64 * 1_000_000,
         at_step: (index == 1).then_some(1),
         time_to_live_s: (index == 2).then_some(0.001),
-        action: Some(actions[index % 5]),
+        action: Some(actions[index % actions.len()].clone()),
     };
-    let commands: Vec<_> = (0..5).map(command).collect();
+    let commands: Vec<_> = (0..6).map(command).collect();
     let deadband = pb::Deadband { force_n: Some(0.01), force_fraction: Some(0.1), ..Default::default() };
     let open = pb::TouchOpen {
         session_id: "0123456789abcdef".into(),

@@ -24,7 +24,7 @@ class Course:
 class Commands:
     """All commands, by the step at which they acted: one row of each array per command.
 
-    `kind` is push, grasp, pose, release or end_of_lease. `place_m` is the place of a push, the position of a pose, or the
+    `kind` is push, grasp, pose, tie, release or end_of_lease. `place_m` is the place of a push, the position of a pose, or the
     displacement by a grasp; `force_n` is the force of a push; NaN for other kinds. `point` is the row of the point, or -1.
     """
 

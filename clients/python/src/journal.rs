@@ -62,6 +62,10 @@ impl CommandColumns {
                 ("grasp", from_vector(grasp.displacement_m.as_ref()).to_array(), NONE, i64::from(grasp.point))
             }
             Some(Action::Pose(pose)) => ("pose", from_vector(pose.place_m.as_ref()).to_array(), NONE, -1),
+            Some(Action::Tie(tie)) => {
+                let first = tie.bites.first().map_or(NONE, |bite| from_vector(bite.place_m.as_ref()).to_array());
+                ("tie", first, NONE, -1)
+            }
             Some(Action::Release(_)) | None => ("release", NONE, NONE, -1),
         };
         self.step.push(step);

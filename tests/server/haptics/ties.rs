@@ -10,6 +10,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::scene::{BUILT_IN, Scene};
+use palpate_tissue::select::scheme_selection::NEVER;
 
 const SCRIPT: &str = r#"
 duration_s = 0.3
@@ -68,8 +69,7 @@ async fn a_thread_over_the_network_has_the_bits_of_a_script_and_stays_when_its_t
         palpate_client::snapshot::collect(parts).await.unwrap()
     };
     let reader = palpate_session::journal::JournalReader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
-    let never = palpate_tissue::select::scheme_selection::NEVER;
-    let (saved, _) = palpate_session::journal::session_at(reader, &limits, 600, &never).unwrap();
+    let (saved, _) = palpate_session::journal::session_at(reader, &limits, 600, &NEVER).unwrap();
     let ties = saved.tissue().ties();
     assert!(ties.len() == 1 && ties[0].tensions_n[0] > 1e-3, "{ties:?}");
 }

@@ -250,7 +250,7 @@ impl Ties {
         for laid in &self.laid {
             add(&(laid.number as u64).to_le_bytes());
             add(&[u8::from(laid.is_broken)]);
-            let vectors = laid.forces_n.iter().chain([&laid.apart_m]).flat_map(|vector| vector.to_array());
+            let vectors = laid.forces_n.iter().chain([&laid.apart_m]).flat_map(DVec3::to_array);
             laid.lengths_m.iter().copied().chain(vectors).for_each(|value| add(&value.to_bits().to_le_bytes()));
         }
     }
@@ -259,7 +259,7 @@ impl Ties {
     pub(crate) fn broken_point(&self, model: &Model, is_good: impl Fn(usize) -> bool) -> Option<usize> {
         self.laid.iter().find_map(|laid| {
             let mut points = laid.points().map(|point| model.index_of(point));
-            let vectors = laid.forces_n.iter().chain([&laid.apart_m]).flat_map(|vector| vector.to_array());
+            let vectors = laid.forces_n.iter().chain([&laid.apart_m]).flat_map(DVec3::to_array);
             // NaN is not below the bound.
             if !vectors.chain(laid.lengths_m.iter().copied()).all(|value| value.abs() < LARGEST) {
                 return Some(points.next().unwrap_or(0));
