@@ -8,9 +8,8 @@ use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::rigid_tip_work;
 use palpate_tissue::scene::Scene;
-use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_reach};
+use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_reach, check_tie, check_tie_number};
 use palpate_tissue::scene::script::Action;
-use palpate_tissue::scene::tie::{check_tie, check_tie_number};
 use palpate_tissue::shape::RestShape;
 
 /// Rules for the commands of one session that do not depend on their time: its scene and its limits. They never

@@ -187,7 +187,7 @@ pub trait Tissue: Send {
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip);
     /// Lays thread or clip number `number` from the next step on, or cuts it and takes it out (`None`). With the bites that it has already,
     /// only its length, friction or strength changes. Numbers are those of threads and clips alone, from 0: tools have others. Isn't
-    /// checked: see [`check_tie`](crate::scene::tie::check_tie).
+    /// checked: see [`check_tie`](crate::scene::action_check::check_tie).
     fn tie(&mut self, number: usize, tie: Option<Tie>);
     /// Returns the threads and clips, by ascending number, those that broke included.
     fn ties(&self) -> Vec<TieState>;
@@ -271,7 +271,7 @@ pub trait Tissue: Send {
     fn is_within_step(&self) -> bool;
     /// Continues after a blow-up, from the state of the last checkpoint. `step` is [`BlowUp::step`], to which
     /// the step count is set. If `to_rest`, or if that state has passed no check since a change or recovery,
-    /// the tissue continues at rest. Releases all tools, ends halvings of the substep, and drops a running
+    /// the tissue continues at rest. Releases all tools, takes out threads and clips, ends halvings of the substep, and drops a running
     /// audit.
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;
     /// Returns the state of a point at the end of the last step.

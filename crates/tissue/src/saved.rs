@@ -21,9 +21,9 @@ use palpate_haptics::{Coupling, Tip, TipShape};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::limits::Limits;
-use crate::scene::action_check::check_tip;
+use crate::scene::action_check::{check_tie_number, check_tip};
 use crate::scene::profile::{CentreProfile, LoadProfile, Motion, MotionProfile, Move, Poke, Profile, StrengthProfile};
-use crate::scene::tie::{Bite, Tie, TieKind, check_tie_number};
+use crate::scene::tie::{Bite, Tie, TieKind};
 use crate::scene::{Integrator, Named, Precision};
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -697,7 +697,7 @@ impl SavedBites {
         }
     }
 
-    /// Returns the tie, whose numbers are finite. The rest is for [`check_tie`](crate::scene::tie::check_tie).
+    /// Returns the tie, whose numbers are finite. The rest is for [`check_tie`](crate::scene::action_check::check_tie).
     pub(crate) fn restored(&self, checks: &Checks<'_>) -> Result<Tie> {
         let bites = self.bites.iter().map(|(place_m, radius_m)| {
             Ok(Bite { place_m: checks.vector(*place_m)?, radius_m: checks.number(*radius_m)? })

@@ -4,9 +4,10 @@ use glam::DVec3;
 use palpate_haptics::{Coupling, Tip, TipShape};
 
 use super::profile::Poke;
+use super::tie::{Bite, MAX_BITES, Tie, TieKind};
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
-use palpate_refusal::{Reason, Refusal, Result, finite, finite_vector, legible, not_negative, number};
+use palpate_refusal::{Reason, Refusal, Result, finite, finite_vector, legible, not_negative, number, positive};
 
 /// Checks a physical value of a scene. Squares and products of values in this range stay within single
 /// precision.
@@ -137,4 +138,49 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         number(&format!("{field}.damping_n_s_per_m"), damping_n_s_per_m, "from 0 to 1e12", damps)?;
     }
     Ok(())
+}
+
+/// Checks a tie; `field` is the key that a refusal gives.
+///
+/// # Errors
+/// Refuses a thread with fewer than two bites or more than [`MAX_BITES`], and a clip with another number than two; a bite off the tissue
+/// ([`Reason::OffTissue`]), and a radius that no tip may have there; a length that is not above 0 or longer than a tool may reach; a
+/// friction that is not from 0 to 10, and a strength that is not from 1e-12 to 1e12 N.
+pub fn check_tie(field: &str, shape: &dyn RestShape, tie: &Tie, limits: &Limits) -> Result<()> {
+    let Tie { bites, kind, strength_n } = tie;
+    let (is_right, range) = match kind {
+        TieKind::Thread { .. } => ((2..=MAX_BITES).contains(&bites.len()), format!("2 to {MAX_BITES} for a thread")),
+        TieKind::Clip => (bites.len() == 2, "2 for a clip".to_owned()),
+    };
+    if !is_right {
+        let message = format!("has {} bites: must have {range}", bites.len());
+        return Err(Refusal::new(Reason::OutOfRange, format!("{field}.bites"), message));
+    }
+    let (most_m, what) = shape.most_tip_radius_m();
+    for (index, Bite { place_m, radius_m }) in bites.iter().enumerate() {
+        let field = format!("{field}.bites[{index}]");
+        finite_vector(&format!("{field}.place_m"), *place_m)?;
+        shape.check_place(&format!("{field}.place_m"), *place_m)?;
+        let range = format!("above 0 and at most {}, {what}", legible(most_m));
+        number(&format!("{field}.radius_m"), *radius_m, &range, |v| v > 0.0 && v <= most_m)?;
+    }
+    if let TieKind::Thread { length_m, friction } = *kind {
+        let of_length = format!("{field}.length_m");
+        positive(&of_length, length_m)?;
+        check_reach(&of_length, shape, length_m, limits)?;
+        number(&format!("{field}.friction"), friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+    }
+    strength_n.map_or(Ok(()), |strength_n| physical(&format!("{field}.strength_n"), strength_n).map(drop))
+}
+
+/// Checks the number of a tie.
+///
+/// # Errors
+/// Refuses a number that is not below `limits.ties` ([`Reason::TooLarge`]).
+pub fn check_tie_number(field: &str, tie: u32, limits: &Limits) -> Result<()> {
+    if tie < limits.ties {
+        return Ok(());
+    }
+    let message = format!("is {tie}, but threads and clips are numbered below {} (limits.ties)", limits.ties);
+    Err(Refusal::new(Reason::TooLarge, field, message))
 }

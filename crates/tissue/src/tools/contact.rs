@@ -180,7 +180,7 @@ pub(crate) struct Contacts {
     pub(crate) tools: Vec<Tool>,
     pub(crate) ties: Ties,
     /// The corners of a solid that cuts have doubled.
-    copies: Option<Arc<CornerCopies>>,
+    pub(crate) copies: Option<Arc<CornerCopies>>,
 }
 
 impl Contacts {

@@ -4,7 +4,8 @@ use glam::DVec3;
 
 use crate::body::model::Model;
 use crate::saved::{Checks, SavedBites, SavedInput, SavedTip};
-use crate::scene::tie::{Tie, check_tie};
+use crate::scene::action_check::check_tie;
+use crate::scene::tie::Tie;
 use crate::tools::applied_force::Push;
 use crate::tools::prescribed::{Grasp, restored_index};
 use palpate_haptics::Tip;

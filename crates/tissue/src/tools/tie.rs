@@ -23,7 +23,8 @@ use crate::body::footprint::Footprint;
 use crate::body::model::Model;
 use crate::body::solid::corner_copies::CornerCopies;
 use crate::saved::{Checks, LARGEST, SavedBites, SavedTie, Vector, ensure};
-use crate::scene::tie::{Bite, Tie, TieKind, check_tie};
+use crate::scene::action_check::check_tie;
+use crate::scene::tie::{Bite, Tie, TieKind};
 use palpate_refusal::Result;
 
 /// How much a thread is stretched by a tension of 1 N, as a part of its length.
