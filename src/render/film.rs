@@ -86,9 +86,11 @@ impl Still {
     pub fn of(session: &Session, shown: Option<&Arc<Skin>>, arrows: Vec<Arrow>) -> Self {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         session.tissue().shown_displacements_m(&mut displacement_m);
+        let cuts = session.tissue().cuts();
         let snapshot = Snapshot::new(&session.model().scene, session.step_count(), session.time_s(), displacement_m)
-            .with_skin(shown);
-        Still { snapshot, cuts: session.tissue().cuts(), shown: shown.cloned(), arrows }
+            .with_skin(shown)
+            .with_cuts(cuts.clone());
+        Still { snapshot, cuts, shown: shown.cloned(), arrows }
     }
 
     /// Returns the simulated time, s.

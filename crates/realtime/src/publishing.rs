@@ -175,8 +175,8 @@ impl SessionTask {
             Err(refusal) => return viewers.iter().for_each(|(viewer, _)| viewer.close(refusal.clone())),
         };
         let snapshot = Snapshot::new(&model.scene, self.session.step_count(), self.session.time_s(), displacement_m);
-        let version = self.session.tissue().cuts().version();
-        let snapshot = Arc::new(snapshot.with_skin(self.handle.skin.as_ref()).of_topology(version));
+        let cuts = self.session.tissue().cuts();
+        let snapshot = Arc::new(snapshot.with_skin(self.handle.skin.as_ref()).with_cuts(cuts));
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
         encoder.post(self.handle.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }

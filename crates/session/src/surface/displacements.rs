@@ -7,6 +7,7 @@ use std::sync::{Arc, OnceLock};
 use super::refine::{Points, grid};
 use super::skin::Skin;
 use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
+use palpate_tissue::Cuts;
 use palpate_tissue::scene::Scene;
 
 /// The displacements of a tissue at one moment, in the order of a frame. All viewers' frames of that moment are made
@@ -17,8 +18,10 @@ pub struct Snapshot {
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// The version of the topology ([`Cuts::version`](palpate_tissue::Cuts::version)).
+    /// The version of the topology ([`Cuts::version`]).
     pub topology_version: u32,
+    /// What is severed.
+    cuts: Cuts,
     /// Displacements, m: x, y and z separate. Point [i, j] of a sheet is at i·ny + j; the vertices of a mesh are in
     /// the order of memory.
     displacement_m: [Vec<f32>; 3],
@@ -44,6 +47,7 @@ impl Snapshot {
             step,
             simulation_time_s,
             topology_version: 0,
+            cuts: Cuts::default(),
             displacement_m,
             skin: None,
             shown_m: OnceLock::new(),
@@ -61,10 +65,10 @@ impl Snapshot {
         Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
     }
 
-    /// Returns this snapshot with the version of the topology.
+    /// Returns this snapshot with what was severed at its moment.
     #[must_use]
-    pub fn of_topology(self, topology_version: u32) -> Self {
-        Snapshot { topology_version, ..self }
+    pub fn with_cuts(self, cuts: Cuts) -> Self {
+        Snapshot { topology_version: cuts.version(), cuts, ..self }
     }
 
     /// Returns the displacements of the shown vertices, m.
@@ -73,7 +77,7 @@ impl Snapshot {
             None => &self.displacement_m,
             Some(skin) => {
                 let [rows, columns] = self.points;
-                self.shown_m.get_or_init(|| skin.displacement_m(&self.displacement_m, rows * columns))
+                self.shown_m.get_or_init(|| skin.displacement_m(&self.displacement_m, &self.cuts, rows * columns))
             }
         }
     }

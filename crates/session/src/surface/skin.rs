@@ -6,9 +6,9 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_geometry::Group;
 
-use palpate_tissue::Model;
 use palpate_tissue::memory;
 use palpate_tissue::shape::{BoundPlace, CellPlace, PointId, RestShape, ShownShape};
+use palpate_tissue::{Cuts, Model};
 
 /// Name of the skin's tables in messages.
 const TABLES: &str = "the shown surface of a mesh";
@@ -157,12 +157,19 @@ impl Skin {
         !self.bound.is_empty() || !self.in_cells.is_empty()
     }
 
+    /// Returns the place in memory of the least corner of the cell that the vertex at each place of a frame moves with; empty but for a
+    /// solid.
+    pub(super) fn cells(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
+        self.in_cells.iter().map(|cell| cell.points[0])
+    }
+
     /// Returns the displacements of the shown vertices, m, in the order of a frame of `count` places, from those of
-    /// the simulated vertices in the order of memory.
+    /// the simulated vertices in the order of memory. Vertices in cells that a cut has parted from others move with their own cell.
     #[allow(clippy::cast_possible_truncation)]
-    pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], count: usize) -> [Vec<f32>; 3] {
+    pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], cuts: &Cuts, count: usize) -> [Vec<f32>; 3] {
         let mut shown_m = [(); 3].map(|()| memory::zeroed::<f32>(count, TABLES));
         for (place, CellPlace { points, weights }) in self.in_cells.iter().enumerate() {
+            let points = &cuts.doubled_corners(points[0]).unwrap_or(*points);
             for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
                 let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
                 shown_m[place] = points.iter().zip(weights).map(part_m).sum::<f64>() as f32;

@@ -21,11 +21,17 @@
 //! Between the points of a refined sheet frames interpolate, also across a wound. So a cell of points with a split triangle is drawn
 //! without refinement, but for the vertices on its sides, so that no gap opens to its refined neighbours.
 
+use std::collections::BTreeMap;
+
+use glam::DVec3;
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Cuts, Model, SeveredJoint};
 
 use super::refine::Refinement;
 use super::skin::Skin;
+
+/// How near to an end an edge of a solid's surface is severed at least, as a part of its length.
+const NEAREST: f64 = 0.05;
 
 /// A place of a triangle at rest that rides on one of its corners: a vertex of a lip.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -76,7 +82,7 @@ pub struct Wound {
 
 impl Wound {
     /// Splits the surface that frames of `refinement` show along the severed springs of a tissue. `skin` is that of its model. `None` if
-    /// other vertices are shown than are simulated: such a surface is shown whole.
+    /// a coarser mesh is simulated than is shown: such a surface is shown whole.
     #[allow(clippy::cast_possible_truncation)]
     pub fn of(model: &Model, cuts: &Cuts, skin: Option<&Skin>, refinement: Refinement) -> Option<Self> {
         let Some(skin) = skin else {
@@ -89,11 +95,15 @@ impl Wound {
             let triangles = (0..2 * points.cell_count()).map(triangle);
             return Some(split(triangles, &edges, points.vertex_count() as u32).refined(refinement));
         };
+        let triangles = skin.triangles().iter().map(|triangle| triangle.map(|vertex| skin.places()[vertex as usize]));
+        if skin.cells().len() > 0 {
+            let edges = parted_edges(model, cuts, skin, triangles.clone());
+            return Some(split(triangles, &edges, skin.vertices().len() as u32));
+        }
         if skin.is_bound() {
             return None;
         }
         let edges = edges_of(model, cuts, |point| skin.places()[point.index()]);
-        let triangles = skin.triangles().iter().map(|triangle| triangle.map(|vertex| skin.places()[vertex as usize]));
         Some(split(triangles, &edges, skin.vertices().len() as u32))
     }
 
@@ -229,6 +239,50 @@ fn edges_of(model: &Model, cuts: &Cuts, vertex: impl Fn(PointId) -> u32) -> Vec<
         }
     };
     cuts.joints(model).into_iter().map(edge).collect()
+}
+
+/// Returns the edges of the surface of a solid whose vertices move with cells that a cut has parted, in the order in which it did. Where the
+/// blade crossed the line between the middles of both cells, the edge is severed in the same plane.
+fn parted_edges(
+    model: &Model,
+    cuts: &Cuts,
+    skin: &Skin,
+    triangles: impl Iterator<Item = [u32; 3]>,
+) -> Vec<SeveredEdge> {
+    let (cells, shape) = (skin.cells().collect::<Vec<_>>(), model.shape());
+    let Some([points, places]) = model.shown_order().filter(|_| !cuts.is_empty()) else { return Vec::new() };
+    let joint = |joint: SeveredJoint| (joint.points.map(|point| places[point.index()]), joint.part);
+    let parts: BTreeMap<[u32; 2], f64> = cuts.joints(model).into_iter().map(joint).collect();
+    let least_m = |cell: u32| shape.rest_m(PointId::new(points[cell as usize] as usize));
+    let mut apart: BTreeMap<[u32; 2], Option<u32>> = BTreeMap::new();
+    let mut edges = BTreeMap::new();
+    for [a, b, c] in triangles {
+        for [from, to] in [[a, b], [b, c], [c, a]] {
+            let ends = [from.min(to), from.max(to)];
+            let of_ends = ends.map(|end| cells[end as usize]);
+            if of_ends[0] == of_ends[1] || edges.contains_key(&ends) {
+                continue;
+            }
+            let pair = [of_ends[0].min(of_ends[1]), of_ends[0].max(of_ends[1])];
+            let since = *apart.entry(pair).or_insert_with(|| cuts.cells_apart_since(model, pair));
+            let Some(version) = since else { continue };
+            // Along the way from the middle of the lower cell to that of the other: only differences count.
+            let [low_m, high_m] = pair.map(least_m);
+            let way_m = high_m - low_m;
+            let half_m = DVec3::splat(0.5 * shape.edge_m());
+            let along = |vertex: u32| {
+                let at_m = skin.rest_m(skin.vertices()[vertex as usize]) - low_m - half_m;
+                at_m.dot(way_m) / way_m.length_squared()
+            };
+            let [begin, end] = ends.map(along);
+            let plane = parts.get(&pair).copied().unwrap_or(0.5);
+            let part = if begin == end { 0.5 } else { ((plane - begin) / (end - begin)).clamp(NEAREST, 1.0 - NEAREST) };
+            edges.insert(ends, SeveredEdge { ends, part, version });
+        }
+    }
+    let mut edges: Vec<SeveredEdge> = edges.into_values().collect();
+    edges.sort_by_key(|edge| edge.version);
+    edges
 }
 
 /// A triangle with severed edges.

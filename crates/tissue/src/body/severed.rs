@@ -144,10 +144,17 @@ impl Cuts {
     }
 
     /// Returns where the corners of a cell of a solid are in [`Tissue::shown_displacements_m`](crate::Tissue::shown_displacements_m), x before
-    /// y before z, if a cut has doubled any of them. `least` is the point at its least corner.
-    pub fn doubled_corners(&self, model: &Model, least: PointId) -> Option<[u32; 8]> {
+    /// y before z, if a cut has doubled any of them. `least` is the place of its least corner there.
+    pub fn doubled_corners(&self, least: u32) -> Option<[u32; 8]> {
         let copies = self.copies.as_ref()?;
-        copies.number_of(model.place_of(least)).map(|number| copies.cubes()[number].corners)
+        copies.number_of(least as usize).map(|number| copies.cubes()[number].corners)
+    }
+
+    /// Returns the version of the topology since which two cells of a solid no longer share a corner that they have in common; `None` if
+    /// they share all, and for other tissues. Cells are given by the places of their least corners, as in [`Cuts::doubled_corners`].
+    pub fn cells_apart_since(&self, model: &Model, cells: [u32; 2]) -> Option<u32> {
+        let (copies, places) = (self.copies.as_ref()?, model.places.solid()?);
+        copies.apart_since(places, cells.map(|cell| cell as usize))
     }
 
     /// Returns whether one more spring can be severed: a solid has spare places for so many doubled corners.
@@ -251,8 +258,8 @@ impl Severed {
         let Some(places) = model.places.solid() else { return Vec::new() };
         let mut copies = self.cuts.copies.take().unwrap_or_else(|| Arc::new(CornerCopies::none(places)));
         let is_severed = |cube: usize, axis: usize| self.has(model.first_end(cube) + 2 * axis);
-        let doubled =
-            Arc::make_mut(&mut copies).sever(places, face.ends[0] as usize, face.number as usize / 2, is_severed);
+        let face_of = (face.ends[0] as usize, face.number as usize / 2);
+        let doubled = Arc::make_mut(&mut copies).sever(places, face_of, face.version, is_severed);
         self.cuts.copies = Some(copies);
         doubled
     }

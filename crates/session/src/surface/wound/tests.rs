@@ -241,6 +241,51 @@ fn a_slit_in_a_mesh_has_two_lips_and_nothing_reaches_across_it() {
     assert_parted(&Mesh::of_skin(&skin), &wound, &edges);
 }
 
+/// A block of 100 × 100 × 40 mm on a table.
+fn block() -> Arc<Model> {
+    let text = "[solid]\norgan = { name = \"phantom\", edge_m = 0.006, seed = 1 }\ncell_m = 0.008\n\
+                fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
+                [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\n[stepping]\nsubsteps = 4\n";
+    model(text, &[])
+}
+
+#[test]
+fn a_slit_in_a_solid_has_two_lips_each_of_which_moves_with_its_own_cells() {
+    let model = block();
+    let mut tissue = at_rest(&model);
+    // Oblique, from one side to beyond the middle, 15 mm deep; then across it.
+    let low = |x: f64, y: f64| DVec3::new(x, y, 0.025);
+    let mut cuts = cut(&mut *tissue, low(-0.006, -0.055), low(0.011, 0.02), 100);
+    cuts.extend(cut(&mut *tissue, low(-0.02, -0.013), low(0.03, -0.02), 60));
+    let skin = Skin::of(&model).unwrap();
+    let (mesh, whole) = (Mesh::of_skin(&skin), tissue.cuts());
+    let triangles = || mesh.triangles.iter().copied();
+    let edges = parted_edges(&model, &whole, &skin, triangles());
+    let wounds: Vec<Wound> =
+        cuts.iter().map(|cuts| Wound::of(&model, cuts, Some(&skin), refinement(&model, 0)).unwrap()).collect();
+    let wound = &wounds[wounds.len() - 1];
+    assert!(edges.len() > 20 && wounds.len() > 10, "{} {}", edges.len(), wounds.len());
+    assert_parted(&mesh, wound, &edges);
+    for (known, cuts) in wounds.iter().zip(&cuts) {
+        let mut known = known.clone();
+        follow(&mut known, wound.clone().since(cuts.version()));
+        assert_eq!(&known, wound, "from version {} on", cuts.version());
+    }
+    // Pressed beside the slit, one lip goes down and the other does not follow.
+    let tip = Tip { radius_m: 0.008, shape: TipShape::Sphere, ..Tip::default() };
+    for step in 0..400 {
+        tissue.pose(1, DVec3::new(0.02, 0.0, 0.048 - 4e-5 * f64::from(step).min(200.0)), tip);
+        tissue.step().unwrap();
+    }
+    let mut simulated_m = std::array::from_fn(|_| Vec::new());
+    tissue.shown_displacements_m(&mut simulated_m);
+    let shown_m = skin.displacement_m(&simulated_m, &tissue.cuts(), skin.vertices().len());
+    let z_m = |vertex: u32| f64::from(shown_m[2][vertex as usize]);
+    let gaps_m = wound.vertices.chunks(2).filter(|lips| lips.len() == 2 && lips[0].others == [lips[1].host; 2]);
+    let most_m = gaps_m.map(|lips| (z_m(lips[0].host) - z_m(lips[1].host)).abs()).fold(0.0, f64::max);
+    assert!(most_m > 5e-4, "{most_m} m");
+}
+
 #[test]
 fn a_wound_that_is_followed_from_any_version_is_the_whole_wound() {
     let model = sheet();
@@ -267,7 +312,9 @@ fn a_new_topology_makes_a_frame_although_nothing_moves() {
     let scene = sheet().scene.clone();
     let at = |step: u64, version: u32| {
         let still = std::array::from_fn(|_| vec![0.0; 12 * 11]);
-        Arc::new(Snapshot::new(&scene, step, step as f64 * 0.001, still).of_topology(version))
+        let mut snapshot = Snapshot::new(&scene, step, step as f64 * 0.001, still);
+        snapshot.topology_version = version;
+        Arc::new(snapshot)
     };
     let grid = Refinement::new(&scene, 0, &Limits::default()).unwrap();
     for encoding in Encoding::ALL {

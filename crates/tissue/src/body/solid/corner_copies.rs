@@ -21,6 +21,16 @@ struct CornerPart {
     place: u32,
 }
 
+/// A copy of a corner.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct CornerCopy {
+    corner: u32,
+    /// The place of the corner or copy from which it came.
+    from: u32,
+    /// The version of the topology since which there is this copy.
+    version: u32,
+}
+
 /// A cube that has a copy among its corners.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct CutCube {
@@ -53,8 +63,8 @@ pub(crate) struct CornerCopies {
     /// The cubes that have copies, in the order in which they got them; and for each least corner, its place in this list.
     cubes: Vec<CutCube>,
     cube_at: Vec<u32>,
-    /// The corner of each copy, by its place.
-    copies: Vec<u32>,
+    /// The copies, by their places.
+    copies: Vec<CornerCopy>,
     /// The first spare place, and how many there are.
     first_spare: u32,
     spare: usize,
@@ -107,7 +117,33 @@ impl CornerCopies {
     #[inline]
     pub(crate) fn corner_of(&self, place: usize) -> usize {
         let copy = place.checked_sub(self.first_spare as usize);
-        copy.and_then(|copy| self.copies.get(copy)).map_or(place, |corner| *corner as usize)
+        copy.and_then(|copy| self.copies.get(copy)).map_or(place, |copy| copy.corner as usize)
+    }
+
+    /// Returns the version of the topology since which two cubes, given by their least corners, no longer share a corner that they have in
+    /// common; `None` if they share all.
+    pub(crate) fn apart_since(&self, places: &SolidPlaces, cubes: [usize; 2]) -> Option<u32> {
+        let [corners, others] = cubes.map(|cube| places.corners_of(cube));
+        let [own, other] = cubes.map(|cube| self.corners_of(places, cube));
+        let mut since = None;
+        for (number, corner) in corners.iter().enumerate() {
+            let Some(same) = others.iter().position(|other| other == corner) else { continue };
+            let found = self.parted_since([own[number], other[same]]);
+            since = since.into_iter().chain(found).min();
+        }
+        since
+    }
+
+    /// Returns since when two places are copies of one corner apart from each other; `None` if they are one place.
+    fn parted_since(&self, [mut one, mut other]: [usize; 2]) -> Option<u32> {
+        let mut since = None;
+        // The one that is newer came from the other, or both from a third.
+        while one != other {
+            let newer = one.max(other);
+            let copy = self.copies.get(newer.checked_sub(self.first_spare as usize)?)?;
+            (one, other, since) = (one.min(other), copy.from as usize, Some(copy.version));
+        }
+        since
     }
 
     /// Returns the cubes that have copies among their corners, in the order in which they got them.
@@ -157,13 +193,13 @@ impl CornerCopies {
         std::iter::successors(first, move |at| number(self.next[*at]))
     }
 
-    /// Severs the face of a cube with the higher coordinate along an axis. `is_severed` tells of each such face whether it is
+    /// Severs the face of a cube with the higher coordinate along an axis, in a version of the topology. `is_severed` tells of each such face whether it is
     /// severed: this one and those before it. Returns the copies that it makes; the caller has made sure that there is room.
     pub(crate) fn sever(
         &mut self,
         places: &SolidPlaces,
-        cube: usize,
-        axis: usize,
+        (cube, axis): (usize, usize),
+        version: u32,
         is_severed: impl Fn(usize, usize) -> bool,
     ) -> Vec<Doubled> {
         let bit = 1 << axis;
@@ -188,16 +224,22 @@ impl CornerCopies {
             }
             let moved = if beyond_face.count_ones() <= before_face.count_ones() { beyond_face } else { before_face };
             let part = part.unwrap_or_else(|| self.add_part(of_whole));
-            made.push(self.double(places, part, moved, &around));
+            made.push(self.double(places, part, (moved, version), &around));
         }
         made
     }
 
     /// Gives some cubes of a part a copy of its corner.
-    fn double(&mut self, places: &SolidPlaces, part: usize, moved: u8, around: &[Option<usize>; 8]) -> Doubled {
+    fn double(
+        &mut self,
+        places: &SolidPlaces,
+        part: usize,
+        (moved, version): (u8, u32),
+        around: &[Option<usize>; 8],
+    ) -> Doubled {
         let CornerPart { corner, place: from, .. } = self.parts[part];
         let to = self.first_spare + self.copies.len() as u32;
-        self.copies.push(corner);
+        self.copies.push(CornerCopy { corner, from, version });
         self.parts[part].cubes &= !moved;
         self.add_part(CornerPart { corner, cubes: moved, place: to });
         for (number, cube) in around.iter().enumerate() {
