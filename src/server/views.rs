@@ -12,6 +12,7 @@ use tracing::info;
 
 use super::charged_caller::ChargedCaller;
 use super::frame_message::frame_messages;
+use super::job_pool::CancelFlag;
 use super::mesh_parts::mesh_part;
 use super::services::Services;
 use super::stream_termination::until_cut;
@@ -97,7 +98,8 @@ impl ViewService for Views {
         let handle = self.0.session(&session_id).await?;
         let guard = handle.open_stream("GetTopology", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let begin = Some((TopologyParts::new(&handle, since_version), guard));
+        let parts = move |_: &CancelFlag| TopologyParts::new(&handle, since_version);
+        let begin = Some((self.0.job_pool.work(&account, parts).await?, guard));
         let out = stream::unfold(begin, |rest| async move {
             let (mut parts, guard) = rest?;
             let message = parts.next();
@@ -114,7 +116,8 @@ impl ViewService for Views {
         let grid = Refinement::new(&handle.model.scene, refinement, &self.0.config.limits)?;
         let guard = handle.open_stream("GetWound", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let begin = Some((WoundParts::new(&handle, grid, since_version), guard));
+        let parts = move |_: &CancelFlag| WoundParts::new(&handle, grid, since_version);
+        let begin = Some((self.0.job_pool.work(&account, parts).await?, guard));
         let out = stream::unfold(begin, |rest| async move {
             let (mut parts, guard) = rest?;
             let message = parts.next();

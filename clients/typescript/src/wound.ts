@@ -61,7 +61,9 @@ export class Wound {
     const isLip = (lip: Lip) => Math.max(lip.host, lip.second, lip.third) < this.vertexCount && isPart(lip.secondPart) && isPart(lip.thirdPart);
     const isCut = ({ first, count, corners }: Cut) =>
       count > 0 && first + count <= this.triangleCount && corners.length % 3 === 0 && corners.every((corner) => corner < end);
-    if (!vertices.every(isLip) || !cuts.every(isCut)) throw new RangeError("the server's wound is not whole");
+    // Otherwise hiding them would have no end.
+    const hidden = cuts.reduce((sum, { count }) => sum + count, 0);
+    if (!vertices.every(isLip) || !cuts.every(isCut) || hidden > this.triangleCount) throw new RangeError("the server's wound is not whole");
     if (isNew) {
       this.vertices.length = 0;
       this.cuts.clear();

@@ -99,7 +99,8 @@ export class ShownWound {
 
   private show({ first, count, corners }: Cut): void {
     const { wound } = this;
-    if (!wound || this.vertexOf.length + corners.length > MAX_SLOTS) return;
+    const added = corners.filter((corner) => !this.slotOf.has(corner)).length;
+    if (!wound || this.vertexOf.length + added > MAX_SLOTS) return;
     const places = this.placesOf.get(first) ?? [];
     for (const place of places) this.write(place, [0, 0, 0], false);
     this.free.push(...places.splice(0));

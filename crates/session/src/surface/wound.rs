@@ -260,7 +260,9 @@ fn parted_edges(
         for [from, to] in [[a, b], [b, c], [c, a]] {
             let ends = [from.min(to), from.max(to)];
             let of_ends = ends.map(|end| cells[end as usize]);
-            if of_ends[0] == of_ends[1] || edges.contains_key(&ends) {
+            // Most cells are beside no cut.
+            let is_whole = of_ends.iter().all(|cell| cuts.doubled_corners(*cell).is_none());
+            if is_whole || of_ends[0] == of_ends[1] || edges.contains_key(&ends) {
                 continue;
             }
             let pair = [of_ends[0].min(of_ends[1]), of_ends[0].max(of_ends[1])];

@@ -243,5 +243,7 @@ impl Places {
     pub(crate) fn identify(&self, scene: &Scene, add: &mut impl FnMut(&[u8])) {
         let order = self.surface().map_or(&[][..], |places| places.slots.vertex_of());
         scene.body.kind().identify(order, add);
+        // Which faces can be severed depends on it.
+        self.solid().iter().for_each(|places| add(&(places.spare().len() as u64).to_le_bytes()));
     }
 }

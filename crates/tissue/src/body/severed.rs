@@ -11,7 +11,7 @@ use std::sync::Arc;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::Model;
-use crate::body::solid::corner_copies::{CornerCopies, Doubled};
+use crate::body::solid::corner_copies::{CornerCopies, DoubledCorner};
 use crate::saved::{SavedSpring, ensure, unsound};
 use crate::shape::PointId;
 use palpate_refusal::Result;
@@ -243,7 +243,7 @@ impl Severed {
     }
 
     /// Adds a spring. Returns the corners that this doubles, if the spring was whole.
-    pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<Doubled>> {
+    pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<DoubledCorner>> {
         let [end, _] = spring.ends_of(model);
         if self.has(end) {
             return None;
@@ -254,7 +254,7 @@ impl Severed {
     }
 
     /// Doubles the corners that a severed face sets free.
-    fn double(&mut self, model: &Model, face: &SeveredSpring) -> Vec<Doubled> {
+    fn double(&mut self, model: &Model, face: &SeveredSpring) -> Vec<DoubledCorner> {
         let Some(places) = model.places.solid() else { return Vec::new() };
         let mut copies = self.cuts.copies.take().unwrap_or_else(|| Arc::new(CornerCopies::none(places)));
         let is_severed = |cube: usize, axis: usize| self.has(model.first_end(cube) + 2 * axis);

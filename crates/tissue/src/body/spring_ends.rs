@@ -71,6 +71,11 @@ impl Model {
         }
     }
 
+    /// Returns whether springs may end at a place in memory: in a solid, whether it is the least corner of a cube.
+    pub(crate) fn is_spring_end(&self, place: usize) -> bool {
+        self.places.solid().is_none_or(|places| places.weight(place) > 0.0)
+    }
+
     /// Returns where the end of a spring at a place in memory is at rest, m: in a solid the middle of a cube.
     pub(crate) fn end_at_rest_m(&self, place: usize) -> DVec3 {
         match &self.places {

@@ -13,7 +13,7 @@ use crate::body::severed::{Cuts, Severed, SeveredSpring};
 use crate::body::sheet::cuts::SheetCuts;
 use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
-use crate::body::solid::corner_copies::Doubled;
+use crate::body::solid::corner_copies::DoubledCorner;
 use crate::body::solid::{self, NeoHookean, PointLoad, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
 use crate::body::spring_ends::SHEET_ENDS;
 use crate::body::surface::pressure::{Pressure, push_of};
@@ -211,7 +211,7 @@ impl<T: Real> SweepTables<T> {
     }
 
     /// Severs a spring. Returns the corners that this doubles, if the spring was whole.
-    pub(crate) fn sever(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<Doubled>> {
+    pub(crate) fn sever(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<DoubledCorner>> {
         let doubled = self.severed.add(model, spring)?;
         self.set_spring(model, &spring, true);
         if let (Some(solid), Some(places), Some(copies)) =

@@ -98,6 +98,9 @@ fn check_edge(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     Ok(())
 }
 
+/// Largest radius of a bite, in distances between points: a session may have a thousand of them.
+const MAX_BITE_EDGES: f64 = 8.0;
+
 /// Least radius of a rigid tip, in edges of a cell.
 const MIN_RIGID_RADIUS: f64 = 0.25;
 
@@ -156,12 +159,12 @@ pub fn check_tie(field: &str, shape: &dyn RestShape, tie: &Tie, limits: &Limits)
         let message = format!("has {} bites: must have {range}", bites.len());
         return Err(Refusal::new(Reason::OutOfRange, format!("{field}.bites"), message));
     }
-    let (most_m, what) = shape.most_tip_radius_m();
+    let most_m = MAX_BITE_EDGES * shape.edge_m();
     for (index, Bite { place_m, radius_m }) in bites.iter().enumerate() {
         let field = format!("{field}.bites[{index}]");
         finite_vector(&format!("{field}.place_m"), *place_m)?;
         shape.check_place(&format!("{field}.place_m"), *place_m)?;
-        let range = format!("above 0 and at most {}, {what}", legible(most_m));
+        let range = format!("above 0 and at most {}, {MAX_BITE_EDGES} distances between points", legible(most_m));
         number(&format!("{field}.radius_m"), *radius_m, &range, |v| v > 0.0 && v <= most_m)?;
     }
     if let TieKind::Thread { length_m, friction } = *kind {

@@ -116,16 +116,14 @@ impl<T: Real> TissueState<T> {
         crossings.extend(self.torn());
         crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
         crossings.dedup_by_key(|crossing| (crossing.place, crossing.spring.number));
-        if crossings.is_empty() {
+        if crossings.is_empty() || !self.tables.severed.has_room(&self.model) {
             return self.ended(StepStage::Contact);
         }
         let version = self.tables.severed.version() + 1;
         let mut any = false;
         // Discs share the copies of corners, which change.
         self.contacts.follow_cuts(&self.model, None);
-        if self.tables.severed.copies().is_some() {
-            self.applied.follow_cuts(None);
-        }
+        self.applied.give_up_copies();
         for crossing in crossings {
             any |= self.sever(&crossing, version);
         }
@@ -142,8 +140,8 @@ impl<T: Real> TissueState<T> {
     pub(super) fn follow_cuts(&mut self) {
         let copies = self.tables.severed.copies().cloned();
         self.contacts.follow_cuts(&self.model, copies.as_ref());
-        if copies.is_some() {
-            self.applied.follow_cuts(copies.as_ref());
+        if let Some(copies) = &copies {
+            self.applied.follow_cuts(&self.model, &self.tables.layout, copies);
         }
     }
 

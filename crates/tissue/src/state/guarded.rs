@@ -87,16 +87,17 @@ impl<T: Real> TissueState<T> {
         let due = self.steps.is_multiple_of(interval) || self.inputs.len() >= MAX_INPUTS;
         let farthest = farthest_in_spacings(&self.model);
         let settled = self.tables.is_settled(farthest);
-        let scan = || match broken_point(&self.model, &self.tables.layout, &self.state) {
-            Some(index) => Err(CheckFailure::NotFinite { point: self.model.shape().name(self.model.point_at(index)) }),
-            None => Ok(()),
+        let broken = |index: usize| {
+            let index = self.tables.severed.copies().map_or(index, |copies| copies.corner_of(index));
+            Err(CheckFailure::NotFinite { point: self.model.shape().name(self.model.point_at(index)) })
         };
+        let scan = || broken_point(&self.model, &self.tables.layout, &self.state).map_or(Ok(()), broken);
         if !settled {
             scan()?;
         }
         let TissueState { model, tables, state, prescribed, contacts, .. } = &*self;
         if let Some(index) = broken_by_tools(model, &tables.layout, state, prescribed, contacts, farthest) {
-            return Err(CheckFailure::NotFinite { point: self.model.shape().name(self.model.point_at(index)) });
+            return broken(index);
         }
         if !due {
             return Ok(());
@@ -222,7 +223,6 @@ impl<T: Real> TissueState<T> {
         self.work = checkpoint.work;
         self.tables.set_severed(&self.model, &checkpoint.cuts);
         let was = checkpoint.halvings;
-        self.follow_cuts();
         self.halve(was, halvings);
         self.tables.is_settled(0.0);
         self.tables.take_work();
@@ -349,6 +349,7 @@ impl<T: Real> TissueState<T> {
             // Also discards what the end of a force or a grasp would add to the next substep.
             self.state = State::at_rest(&self.tables.layout, self.state.kept.len());
             (self.applied, self.prescribed, self.contacts) = (Applied::new(), Prescribed::new(), Contacts::default());
+            self.follow_cuts();
         }
         // They may be what the tissue did not bear.
         self.contacts.ties = Ties::default();

@@ -274,6 +274,8 @@ fn restored_as<T: Real>(
     // Computes what each tile adds to the volume; sleeping tiles are not added up again later.
     let tiles: Vec<usize> = (0..sheet.tiles.tile_count()).collect();
     sheet.tables.volume_change(&sheet.state.u, &tiles);
+    let has_place = parts.checkpoint.is_some() || parts.ties.at_checkpoint.is_empty();
+    ensure(has_place, "threads or clips of a state to go back to that is none")?;
     let checkpoint = parts.checkpoint.as_ref().map(|saved| {
         let mut state = State::zero(&layout, sheet.state.kept.len());
         fill(&mut state)?;
@@ -317,8 +319,8 @@ fn checkpoint_of<T: Real>(
     let mut contacts = Contacts::restored((&saved.contacts, ties), model, checks)?;
     let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
     contacts.follow_cuts(model, cuts.copies());
-    if cuts.copies().is_some() {
-        applied.follow_cuts(cuts.copies());
+    if let Some(copies) = cuts.copies() {
+        applied.follow_cuts(model, layout, copies);
     }
     Ok(Checkpoint {
         steps: saved.steps,

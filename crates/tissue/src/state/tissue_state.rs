@@ -196,7 +196,7 @@ impl<T: Real> TissueState<T> {
         let reader = LazyCell::new(|| self.reader());
         let own = self.prescribed.grasped().map(|(index, motion)| {
             let free = reader.free_velocity_m_per_s(index);
-            model.relative_mass_at(index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
+            tables.relative_mass_at(model, index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
         });
         let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
         energy.kinetic_j += grasped_j;
@@ -327,7 +327,13 @@ impl<T: Real> Tissue for TissueState<T> {
     fn reaction_around_n(&self, poke: &Poke) -> DVec3 {
         self.keep_growth();
         let reader = self.reader();
-        let reaction_n = |point| reader.point(self.model.place_of(point)).reaction_n();
+        let reaction_n = |point| {
+            let place = self.model.place_of(point);
+            match self.tables.severed.copies() {
+                Some(copies) => copies.places_of(place).map(|place| reader.point(place).reaction_n()).sum(),
+                None => reader.point(place).reaction_n(),
+            }
+        };
         reaction_around(self.model.shape(), poke, reaction_n)
     }
 

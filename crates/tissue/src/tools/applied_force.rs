@@ -300,9 +300,17 @@ impl<T: Real> Applied<T> {
 
     /// Lets the forces act on these copies of a solid's corners too: each gets the part of the force on its corner that its mass is of the
     /// corner's.
-    pub(crate) fn follow_cuts(&mut self, copies: Option<&Arc<CornerCopies>>) {
-        self.copies = copies.cloned();
-        self.forget();
+    pub(crate) fn follow_cuts(&mut self, model: &Model, layout: &Layout, copies: &Arc<CornerCopies>) {
+        self.copies = Some(copies.clone());
+        for term in &mut self.terms {
+            let poke = term.wanted.poke;
+            term.place(&poke, model, layout, Some(copies));
+        }
+    }
+
+    /// Gives up the copies that it knows; its forces stay as they are until it follows others.
+    pub(crate) fn give_up_copies(&mut self) {
+        self.copies = None;
     }
 
     /// Returns the corner at a place in memory, and the part of the force on the corner that acts there.

@@ -260,9 +260,7 @@ impl Contacts {
                 rigid.follow_cuts(model, &tool.footprint);
             }
         }
-        if let Some(copies) = copies {
-            self.ties.follow_cuts(model, copies);
-        }
+        self.ties.follow_cuts(model, copies);
     }
 
     /// Returns whether there are neither tools nor threads and clips.

@@ -161,6 +161,7 @@ impl Ties {
         };
         let is_clip = |tie: &Tie| tie.kind == TieKind::Clip;
         if let Ok(index) = found
+            && !self.laid[index].is_broken
             && self.laid[index].tie.bites == tie.bites
             && is_clip(&self.laid[index].tie) == is_clip(&tie)
         {
@@ -174,10 +175,14 @@ impl Ties {
         }
     }
 
-    /// Lets the bites hold these copies of a solid's corners.
-    pub(crate) fn follow_cuts(&mut self, model: &Model, copies: &Arc<CornerCopies>) {
+    /// Lets the bites hold these copies of a solid's corners; `None` gives up those that they know, but for discs that a checkpoint shares.
+    pub(crate) fn follow_cuts(&mut self, model: &Model, copies: Option<&Arc<CornerCopies>>) {
         for laid in &mut self.laid {
-            laid.discs = Arc::new(TiedDiscs::new(model, &laid.tie.bites, Some(copies)));
+            if copies.is_some() {
+                laid.discs = Arc::new(TiedDiscs::new(model, &laid.tie.bites, copies));
+            } else if let Some(discs) = Arc::get_mut(&mut laid.discs) {
+                discs.footprints.iter_mut().for_each(|footprint| footprint.follow_cuts(model, None));
+            }
         }
     }
 
@@ -248,6 +253,9 @@ impl Ties {
 
     /// Adds the ties to the hash of a tissue; nothing if there are none.
     pub(crate) fn hash(&self, add: &mut impl FnMut(&[u8])) {
+        if !self.laid.is_empty() {
+            add(&(self.laid.len() as u64).to_le_bytes());
+        }
         for laid in &self.laid {
             add(&(laid.number as u64).to_le_bytes());
             add(&[u8::from(laid.is_broken)]);
@@ -274,9 +282,10 @@ impl Ties {
     }
 
     pub(crate) fn restored(saved: &[SavedTie], model: &Model, checks: &Checks<'_>) -> Result<Self> {
-        let laid: Vec<LaidTie> =
-            saved.iter().map(|tie| LaidTie::restored(tie, model, checks)).collect::<Result<_>>()?;
-        ensure(laid.is_sorted_by(|a, b| a.number < b.number), "threads or clips out of order")?;
+        // Each takes work: first that there are no more than numbers.
+        ensure(saved.is_sorted_by(|a, b| a.number < b.number), "threads or clips out of order")?;
+        saved.last().map_or(Ok(0), |last| checks.tie(last.number))?;
+        let laid = saved.iter().map(|tie| LaidTie::restored(tie, model, checks)).collect::<Result<_>>()?;
         Ok(Ties { laid })
     }
 }
@@ -441,12 +450,15 @@ impl LaidTie {
         let vectors = |values: &[Vector]| -> Result<Vec<DVec3>> {
             values.iter().map(|value| checks.vector(*value)).collect::<Result<_>>()
         };
+        let forces_n = vectors(&saved.forces_n)?;
+        let is_loose = forces_n.iter().all(|force_n| *force_n == DVec3::ZERO);
+        ensure(is_loose || !saved.is_broken, "a broken thread that pulls")?;
         Ok(LaidTie {
             number: checks.tie(saved.number)?,
             discs: Arc::new(TiedDiscs::new(model, &tie.bites, None)),
             lengths_m,
             apart_m: checks.vector(saved.apart_m)?,
-            forces_n: vectors(&saved.forces_n)?,
+            forces_n,
             tensions_n,
             peak_n: checks.number(saved.peak_n)?,
             is_broken: saved.is_broken,

@@ -42,7 +42,7 @@ pub(crate) struct CutCube {
 
 /// A copy that a severed face has made.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Doubled {
+pub(crate) struct DoubledCorner {
     /// The place of the corner or copy whose cubes fell apart.
     pub(crate) from: usize,
     /// The place of the new copy.
@@ -124,7 +124,7 @@ impl CornerCopies {
     /// common; `None` if they share all.
     pub(crate) fn apart_since(&self, places: &SolidPlaces, cubes: [usize; 2]) -> Option<u32> {
         let [corners, others] = cubes.map(|cube| places.corners_of(cube));
-        let [own, other] = cubes.map(|cube| self.corners_of(places, cube));
+        let [own, other] = cubes.map(|cube| corners_of(places, Some(self), cube));
         let mut since = None;
         for (number, corner) in corners.iter().enumerate() {
             let Some(same) = others.iter().position(|other| other == corner) else { continue };
@@ -157,15 +157,6 @@ impl CornerCopies {
         self.cube_at.get(cube).filter(|at| **at != NONE).map(|at| *at as usize)
     }
 
-    /// Returns the places of the corners of a cube, x before y before z.
-    #[inline]
-    pub(crate) fn corners_of(&self, places: &SolidPlaces, cube: usize) -> [usize; 8] {
-        match self.number_of(cube) {
-            Some(number) => self.cubes[number].corners.map(|place| place as usize),
-            None => places.corners_of(cube),
-        }
-    }
-
     /// Returns the cubes around a place that have copies among their corners, by their places in the list, ascending.
     pub(crate) fn cut_cubes_around(&self, places: &SolidPlaces, place: usize) -> Vec<usize> {
         let around = cubes_around(places, self.corner_of(place));
@@ -193,6 +184,12 @@ impl CornerCopies {
         std::iter::successors(first, move |at| number(self.next[*at]))
     }
 
+    /// Returns the places of a corner: its own, and those of its copies.
+    pub(crate) fn places_of(&self, corner: usize) -> impl Iterator<Item = usize> {
+        let of_parts = self.parts_of(corner).map(|part| self.parts[part].place as usize);
+        of_parts.chain([corner].into_iter().filter(move |_| self.first_of[corner] == NONE))
+    }
+
     /// Severs the face of a cube with the higher coordinate along an axis, in a version of the topology. `is_severed` tells of each such face whether it is
     /// severed: this one and those before it. Returns the copies that it makes; the caller has made sure that there is room.
     pub(crate) fn sever(
@@ -201,7 +198,7 @@ impl CornerCopies {
         (cube, axis): (usize, usize),
         version: u32,
         is_severed: impl Fn(usize, usize) -> bool,
-    ) -> Vec<Doubled> {
+    ) -> Vec<DoubledCorner> {
         let bit = 1 << axis;
         let Some(beyond) = places.cube_across(cube, axis, true) else { return Vec::new() };
         let mut made = Vec::new();
@@ -236,7 +233,7 @@ impl CornerCopies {
         part: usize,
         (moved, version): (u8, u32),
         around: &[Option<usize>; 8],
-    ) -> Doubled {
+    ) -> DoubledCorner {
         let CornerPart { corner, place: from, .. } = self.parts[part];
         let to = self.first_spare + self.copies.len() as u32;
         self.copies.push(CornerCopy { corner, from, version });
@@ -252,7 +249,7 @@ impl CornerCopies {
             });
             self.cubes[at].corners[number] = to;
         }
-        Doubled { from: from as usize, to: to as usize, cubes: moved, corner }
+        DoubledCorner { from: from as usize, to: to as usize, cubes: moved, corner }
     }
 
     /// Adds a part. Returns its number.
@@ -265,7 +262,16 @@ impl CornerCopies {
     }
 }
 
-impl Doubled {
+/// Returns the places of the corners of a cube, x before y before z, in a solid with these copies.
+#[inline]
+pub(crate) fn corners_of(places: &SolidPlaces, copies: Option<&CornerCopies>, cube: usize) -> [usize; 8] {
+    match copies.and_then(|copies| copies.number_of(cube).map(|number| &copies.cubes[number])) {
+        Some(cut) => cut.corners.map(|place| place as usize),
+        None => places.corners_of(cube),
+    }
+}
+
+impl DoubledCorner {
     /// Returns the cubes of the copy.
     pub(crate) fn cubes(&self, places: &SolidPlaces) -> impl Iterator<Item = usize> + use<> {
         let (around, cubes) = (cubes_around(places, self.corner as usize), self.cubes);

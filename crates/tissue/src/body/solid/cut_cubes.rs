@@ -116,6 +116,12 @@ impl<T: Real> CutCubes<T> {
             let mut from = 0;
             while from < self.corners.len() {
                 let count = V::LANES.min(self.corners.len() - from);
+                // What sleeps needs no force: a survey looks at one tile after another.
+                let is_awake = |at: &u32| over.is_awake(*at as usize / layout.stride, *at as usize % layout.stride);
+                if !over.awake.is_full() && !self.corners[from..from + count].as_flattened().iter().any(is_awake) {
+                    from += V::LANES;
+                    continue;
+                }
                 let mut values = [[[T::default(); BLOCK]; 3]; 8];
                 for lane in 0..count {
                     for corner in 0..8 {

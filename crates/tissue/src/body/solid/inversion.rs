@@ -6,7 +6,7 @@
 
 use glam::DVec3;
 
-use super::corner_copies::CornerCopies;
+use super::corner_copies::{CornerCopies, corners_of};
 use super::places::SolidPlaces;
 use crate::kernel::field::Layout;
 use crate::kernel::real::Real;
@@ -23,8 +23,7 @@ pub(crate) fn is_inverted<T: Real>(
         DVec3::from_array(std::array::from_fn(|c| u[c * layout.plane + at].wide()))
     };
     let has_inverted_corner = |cube: usize| {
-        let corners = copies.map_or_else(|| places.corners_of(cube), |copies| copies.corners_of(places, cube));
-        let corners = corners.map(displacement);
+        let corners = corners_of(places, copies, cube).map(displacement);
         let edge = |corner: usize, axis: usize| {
             let (near, far) = (corner & !(1 << axis), corner | 1 << axis);
             DVec3::AXES[axis] + corners[far] - corners[near]

@@ -26,7 +26,7 @@ use std::ops::Range;
 
 use glam::DVec3;
 
-use super::corner_copies::{CornerCopies, Doubled};
+use super::corner_copies::{CornerCopies, DoubledCorner};
 use super::cut_cubes::{CutCubes, gather_cut};
 use super::neo_hookean::{NeoHookean, Patterns, Stress, side};
 use super::places::SolidPlaces;
@@ -198,7 +198,13 @@ impl<T: Real> SolidTables<T> {
     }
 
     /// Takes the copy of a corner into the tables.
-    pub(crate) fn double(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, doubled: &Doubled) {
+    pub(crate) fn double(
+        &mut self,
+        places: &SolidPlaces,
+        layout: &Layout,
+        copies: &CornerCopies,
+        doubled: &DoubledCorner,
+    ) {
         for cube in doubled.cubes(places) {
             if let Some(number) = copies.number_of(cube) {
                 self.take_out(places, layout, copies, number);

@@ -11,6 +11,7 @@ use glam::DVec3;
 use super::{Crossing, EdgeSweep};
 use crate::body::severed::SeveredSpring;
 use crate::body::solid::SolidPlaces;
+use crate::body::solid::corner_copies::corners_of;
 use crate::body::spring_ends::SpringEnd;
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
@@ -115,10 +116,7 @@ impl<T: Real> TissueState<T> {
     /// Returns the displacement of the middle of a cube and its way in this step, m.
     fn middle_motion_m(&self, places: &SolidPlaces, cube: usize) -> [DVec3; 2] {
         let TissueState { model, plan, tables, state, .. } = self;
-        let corners = match tables.severed.copies() {
-            Some(copies) => copies.corners_of(places, cube),
-            None => places.corners_of(cube),
-        };
+        let corners = corners_of(places, tables.severed.copies().map(|copies| &**copies), cube);
         let (mut u, mut d) = (DVec3::ZERO, DVec3::ZERO);
         for corner in corners {
             u += self.vector(&state.u, corner);
@@ -180,10 +178,8 @@ impl<T: Real> TissueState<T> {
             return Vec::new();
         }
         let Some(places) = self.model.places.solid() else { return Vec::new() };
-        let [first, second] = cubes.map(|cube| match self.tables.severed.copies() {
-            Some(copies) => copies.corners_of(places, cube as usize),
-            None => places.corners_of(cube as usize),
-        });
+        let copies = self.tables.severed.copies().map(|copies| &**copies);
+        let [first, second] = cubes.map(|cube| corners_of(places, copies, cube as usize));
         first
             .into_iter()
             .filter(|corner| second.contains(corner))

@@ -57,6 +57,9 @@ impl<T: Real> TissueState<T> {
             for i in rows {
                 for j in columns.clone() {
                     let place = i * across + j;
+                    if !model.is_spring_end(place) {
+                        continue;
+                    }
                     let (own_m, first_end) = (u_m(place), model.first_end(place));
                     model.each_spring(place, |spring| {
                         let is_first = spring.other > place;

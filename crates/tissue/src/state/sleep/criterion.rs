@@ -154,6 +154,21 @@ pub(crate) fn put_to_sleep<T: Real>(
     let least = restoring * (1.0 + model.places.least_extra_anchor());
     let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * least + unknown * survey.largest);
     let mut region = tiles.no_region();
+    if is_cut {
+        // One survey tells of all, and of the energy, which the first tile stands for.
+        tiles.cover(&mut region, settled.iter().copied());
+        let survey = Survey::of(tables, &plan.scheme, state, forces, &region);
+        let is_calm = survey.speed <= slow(epsilon) && balanced(&survey);
+        let may_sleep = settled.iter().map(|tile| tiles.is_settled(*tile, is_calm)).filter(|settled| *settled).count();
+        if may_sleep == settled.len() {
+            Survey::write(tables, &plan.scheme, state, forces, &region, Write::Rest);
+            let energy_j = energy_of(model, plan, &survey).1;
+            let sleepers: Vec<_> =
+                settled.iter().enumerate().map(|(at, tile)| (*tile, if at == 0 { energy_j } else { 0.0 })).collect();
+            tiles.sleep(&sleepers, &state.u, volume_change);
+        }
+        return;
+    }
     let mut sleepers = Vec::new();
     for tile in settled.into_iter().filter(|tile| !held.contains(tile)) {
         tiles.cover(&mut region, std::iter::once(tile));
@@ -162,7 +177,7 @@ pub(crate) fn put_to_sleep<T: Real>(
             sleepers.push((tile, survey));
         }
     }
-    if sleepers.is_empty() || is_cut && sleepers.len() < tiles.region.tiles().len() {
+    if sleepers.is_empty() {
         return;
     }
     tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));

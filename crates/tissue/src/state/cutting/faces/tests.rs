@@ -255,3 +255,74 @@ fn a_force_beside_a_cut_acts_on_both_sides() {
     let [whole_n, cut_n] = [weighed_n(false), weighed_n(true)];
     assert!(whole_n < -0.5 && (cut_n / whole_n - 1.0).abs() < 1e-3, "{whole_n} {cut_n}");
 }
+
+/// A solid that was cut and has come to rest sleeps as a whole, wakes as a whole, and continues from a snapshot of its rest.
+#[test]
+fn a_cut_solid_sleeps_and_continues_from_a_snapshot_of_its_rest() {
+    let model = block(&["material.damping_per_s=200", "stepping.precision=f64"]);
+    let mut tissue = at_rest(&model);
+    cut(&mut *tissue, DVec3::new(0.001, -0.06, 0.012), DVec3::new(0.001, 0.06, 0.012), 150);
+    let press = |tissue: &mut dyn Tissue, depth_m: f64| {
+        let tip = Tip { radius_m: 0.008, friction: 0.3, ..Tip::default() };
+        tissue.pose(1, DVec3::new(0.012, 0.0, 0.04 - depth_m), tip);
+        tissue.step().unwrap();
+    };
+    (0..100).for_each(|step| press(&mut *tissue, 2e-5 * f64::from(step)));
+    tissue.release(1);
+    let steps = (0..20_000).take_while(|_| !tissue.is_still() && tissue.step().is_ok()).count();
+    assert!(tissue.is_still() && tissue.awake_points() == 0 && steps > 100, "{steps}");
+    let saved = tissue.save().plain();
+    let mut again = restored(&model, &saved.parts, &saved.values, &Limits::default()).unwrap();
+    for step in 0..50 {
+        press(&mut *tissue, 2e-5 * f64::from(step));
+        press(&mut *again, 2e-5 * f64::from(step));
+    }
+    assert_eq!(again.state_hash(), tissue.state_hash());
+    assert!(tissue.largest_displacement_m() > 1e-4 && tissue.guard_events() == 0);
+    // After a recovery to rest, tips still move with their own side.
+    let step = tissue.step_count();
+    tissue.recover(step, true);
+    let saved = tissue.save().plain();
+    let mut again = restored(&model, &saved.parts, &saved.values, &Limits::default()).unwrap();
+    for step in 0..50 {
+        press(&mut *tissue, 2e-5 * f64::from(step));
+        press(&mut *again, 2e-5 * f64::from(step));
+    }
+    assert_eq!(again.state_hash(), tissue.state_hash());
+}
+
+/// A solid has room for so many doubled corners. Beyond them a blade severs nothing more, and only pushes.
+#[test]
+fn a_blade_that_finds_no_room_cuts_no_more() {
+    let model = block(&[]);
+    let mut tissue = at_rest(&model);
+    let mut severed = Vec::new();
+    for x in [-0.029, -0.009, 0.011, 0.031] {
+        cut(&mut *tissue, DVec3::new(x, -0.06, -0.01), DVec3::new(x, 0.06, -0.01), 150);
+        severed.push(tissue.cuts().len());
+    }
+    assert!(severed[0] == 40 && severed[1] > 40 && severed[3] == severed[2] && severed[3] < 160, "{severed:?}");
+    assert!(!tissue.cuts().has_room(&model) && tissue.largest_displacement_m().is_finite());
+}
+
+/// A block that is pulled apart tears at the stated strain of the way between the middles of its cells.
+#[test]
+fn a_solid_tears_at_the_stated_strain() {
+    let model = block(&["cutting.tear_strain=0.2", "stepping.precision=f64", "material.damping_per_s=300"]);
+    let mut tissue = TissueState::<f64>::new(&model);
+    let top: Vec<_> = model.points().filter(|point| model.shape().rest_m(*point).z > 0.0399).collect();
+    let mut at = 0.0;
+    for step in 0..2000 {
+        at = 0.004 + 2e-6 * f64::from(step) * 2.0;
+        for (tool, point) in top.iter().enumerate() {
+            tissue.grasp(tool, *point, Grasp::Target(at * DVec3::Z));
+        }
+        tissue.step().unwrap();
+        if !tissue.cuts().is_empty() {
+            break;
+        }
+    }
+    // The block is 4 cells high; held above and below it is strained unevenly, most at its rim.
+    let mean = at / 0.04;
+    assert!(!tissue.cuts().is_empty() && (0.1..0.2).contains(&mean), "{mean}");
+}
