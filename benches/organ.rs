@@ -29,6 +29,7 @@ const TIP: Tip = Tip {
     grasps: false,
     coupling: Coupling::Constraint,
     edge_m: DVec3::ZERO,
+    burn_s: 0.0,
 };
 
 fn model(name: &str, sets: &[String]) -> Arc<Model> {

@@ -118,6 +118,7 @@ const TIP: Tip = Tip {
     grasps: false,
     coupling: palpate_haptics::Coupling::Constraint,
     edge_m: DVec3::ZERO,
+    burn_s: 0.0,
 };
 
 /// Moves a tool straight from one place to another in so many steps, and leaves it there for `rest` more.

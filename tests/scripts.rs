@@ -414,6 +414,66 @@ fn three_stitches_close_a_wound_while_its_lips_are_drawn_apart() {
     assert_eq!(told.as_array().unwrap().len(), 3, "{told}");
 }
 
+/// A tip that rests on the liver from its first pose on, and is taken away at `until_s`.
+fn cautery(burn_s: f64, until_s: f64) -> String {
+    format!(
+        "duration_s = 0.4\nsample_every_s = 0.1\n[[tool]]\ntip = {{ radius_m = 0.004, grasps = true, burn_s = {burn_s:?} }}\n\
+         poses = [{{ at_s = 0.05, place_m = [0.0375, 0.0375, 0.0] }}]\nuntil_s = {until_s:?}\n"
+    )
+}
+
+#[test]
+fn a_tip_of_a_script_burns_through_what_it_touches_for_long_enough() {
+    let scene = built_in("liver", &[]);
+    let model = model(&scene);
+    let severed = |burn_s: f64, until_s: f64| {
+        let (records, summary) = run_whole(&model, &script(&cautery(burn_s, until_s), &scene), false);
+        let severed = summary.topology.map_or(0, |topology| topology.severed);
+        assert_eq!(records.last().unwrap()["summary"]["severed"].as_u64().unwrap_or(0), severed as u64);
+        assert_eq!(summary.guard_events, 0);
+        severed
+    };
+    // It touches for 0.2 s.
+    assert!(severed(0.2, 0.25) > 20);
+    assert_eq!([severed(0.201, 0.25), severed(0.2, 0.249), severed(0.0, 0.4)], [0, 0, 0]);
+    for (tip, expected) in [
+        ("burn_s = -1.0", "tool[0].tip.burn_s: is -1, but must be from 0 to 3600"),
+        ("burn_s = 3601.0", "tool[0].tip.burn_s"),
+        ("burn_s = \"1 s\"", "tool[0].tip.burn_s"),
+    ] {
+        let text = format!(
+            "duration_s = 0.1\nsample_every_s = 0.1\n[[tool]]\ntip = {{ {tip} }}\n\
+             poses = [{{ at_s = 0.0, place_m = [0.03, 0.03, 0.0] }}]\n"
+        );
+        let refusal = Script::parse("s", &text, Path::new(""), &scene, &Limits::default()).unwrap_err().to_string();
+        assert!(refusal.contains(expected), "{refusal}\nexpected: {expected}");
+    }
+    let solid = built_in("liver-solid", &[]);
+    let refusal = Script::parse("s", &cautery(0.2, 0.3), Path::new(""), &solid, &Limits::default()).unwrap_err();
+    assert!(refusal.to_string().contains("tool[0].tip.burn_s: is for a sheet or a surface"), "{refusal}");
+}
+
+#[test]
+fn a_burn_is_part_of_a_snapshot_and_of_a_continued_session() {
+    let scene = built_in("liver", &[]);
+    let (model, burns, limits) = (model(&scene), script(&cautery(0.2, 0.4), &scene), Limits::default());
+    let mut simulation = Simulation::playing(&model, &burns, true, &limits).unwrap();
+    simulation.run_to(150).unwrap();
+    let bytes = simulation.session.save().to_bytes();
+    let saved = Saved::from_bytes(&bytes, &limits).unwrap();
+    let mut again = Session::restore(&model, &saved).unwrap();
+    assert_eq!(again.save().to_bytes(), bytes);
+    for step in 150..400 {
+        let due = burns
+            .actions_at(step)
+            .map(|(tool, action)| Due::in_time(Command::new(tool as u32, Some(step + 1), action)));
+        again.advance(&mut due.collect::<Vec<_>>(), |_| {});
+        simulation.step(0).unwrap();
+        assert_eq!(again.tissue().cuts().is_empty(), step < 249, "after step {step}");
+    }
+    assert_eq!(again.tissue().state_hash(), simulation.session.tissue().state_hash());
+}
+
 #[test]
 fn what_is_wrong_with_a_thread_or_a_clip_is_named() {
     let scene = built_in("liver", &[]);

@@ -133,6 +133,7 @@ const TIP: Tip = Tip {
     grasps: false,
     coupling: Coupling::Constraint,
     edge_m: DVec3::ZERO,
+    burn_s: 0.0,
 };
 
 /// The same pressed in from above, by 10 % of its size, until all is steady.

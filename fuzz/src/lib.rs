@@ -333,6 +333,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             spring: Some(pb::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }),
             shape: pb::TipShape::Disc.into(),
             edge_m: None,
+            burn_s: 0.5,
         }),
     });
     let grasper_pose = pb::command::Action::Instrument(instrument::pose(&InstrumentPose {

@@ -262,6 +262,9 @@ pub struct Tip {
     /// From the tip of a blade to its heel, m, in the tissue's frame.
     #[prost(message, optional, tag = "7")]
     pub edge_m: ::core::option::Option<crate::pb::Vector3>,
+    /// The time of contact after which what lies under it is severed, s; 0: it does not burn.
+    #[prost(double, tag = "8")]
+    pub burn_s: f64,
 }
 impl ::prost::Name for Tip {
     const NAME: &'static str = "Tip";

@@ -69,6 +69,7 @@ pub fn from_tip(field: &str, tip: Option<&pb::Tip>) -> Result<Tip> {
             damping_n_s_per_m: spring.damping_n_s_per_m,
         }),
         edge_m: from_vector(tip.edge_m.as_ref()),
+        burn_s: tip.burn_s,
     })
 }
 
@@ -92,6 +93,7 @@ pub fn tip(tip: &Tip) -> pb::Tip {
             }
         },
         edge_m: (tip.edge_m != DVec3::ZERO).then(|| vector(tip.edge_m)).flatten(),
+        burn_s: tip.burn_s,
     }
 }
 

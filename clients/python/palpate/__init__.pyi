@@ -129,7 +129,8 @@ class Tissue:
 class Tip:
     """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
     `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
-    `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only."""
+    `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only. With
+    `burn_s`, s, a disc severs by heat what it has touched for that time: on sheets and surfaces only."""
 
     def __init__(
         self,
@@ -141,6 +142,7 @@ class Tip:
         damping_n_s_per_m: float = 0.0,
         shape: str = "disc",
         edge_m: Optional[Vector] = None,
+        burn_s: float = 0.0,
     ) -> None: ...
     @property
     def shape(self) -> str:

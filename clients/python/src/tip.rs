@@ -6,7 +6,8 @@ use pyo3::prelude::*;
 
 /// The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
 /// `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
-/// `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only.
+/// `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only. With
+/// `burn_s`, s, a disc severs by heat what it has touched for that time: on sheets and surfaces only.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
@@ -14,9 +15,10 @@ pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
 #[pymethods]
 impl Tip {
     #[new]
+    #[allow(clippy::too_many_arguments)]
     #[pyo3(signature = (
         radius_m=0.005, *, friction=0.2, grasps=false, stiffness_n_per_m=None, damping_n_s_per_m=0.0, shape="disc",
-        edge_m=None
+        edge_m=None, burn_s=0.0
     ))]
     fn new(
         radius_m: f64,
@@ -26,6 +28,7 @@ impl Tip {
         damping_n_s_per_m: f64,
         shape: &str,
         edge_m: Option<[f64; 3]>,
+        burn_s: f64,
     ) -> PyResult<Self> {
         let shape: TipShape = shape.parse().map_err(|message| PyValueError::new_err(format!("shape: {message}")))?;
         let shape = if edge_m.is_some() { TipShape::Blade } else { shape };
@@ -40,6 +43,7 @@ impl Tip {
             grasps,
             coupling,
             edge_m: edge_m.unwrap_or_default().into(),
+            burn_s,
         }))
     }
 

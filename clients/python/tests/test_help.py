@@ -73,7 +73,7 @@ class Help(unittest.TestCase):
             (
                 palpate.Tip,
                 "(radius_m=0.005, *, friction=0.2, grasps=False, stiffness_n_per_m=None, damping_n_s_per_m=0.0, "
-                "shape='disc', edge_m=None)",
+                "shape='disc', edge_m=None, burn_s=0.0)",
             ),
             (
                 palpate.Session.thread,

@@ -21,6 +21,8 @@ export interface Tip {
   shape?: TipShape;
   /** The edge of a blade from the tip, which is the tool's place, to its heel, m: in the frame of the tissue, or of the instrument. */
   edgeM?: Vec3;
+  /** The time of contact after which a disc severs what lies under it, s (cautery). It does not burn if absent. */
+  burnS?: number;
   /** Whether it holds the tissue, and pulls as well as pushes; else it touches. Discs only. */
   grasps?: boolean;
 }
@@ -38,9 +40,9 @@ interface Posed {
 }
 
 /** Converts a pose to a message. */
-export function poseOf({ positionM: [x, y, z], radiusM, friction, shape, grasps, edgeM }: Lead): MessageInitShape<typeof PoseSchema> {
+export function poseOf({ positionM: [x, y, z], radiusM, friction, shape, grasps, edgeM, burnS }: Lead): MessageInitShape<typeof PoseSchema> {
   const edge = edgeM && { x: edgeM[0], y: edgeM[1], z: edgeM[2] };
-  return { positionM: { x, y, z }, tip: { radiusM, friction, shape, grasps, edgeM: edge } };
+  return { positionM: { x, y, z }, tip: { radiusM, friction, shape, grasps, edgeM: edge, burnS } };
 }
 
 /** The newest poses of a tool with a single tip. */
@@ -48,9 +50,10 @@ export class Poses {
   /** Newest first. */
   private recent: Posed[] = [];
   private readonly maxEarlier: number;
-  /** Whether those grasp, and the edge of their blade: earlier poses have the same tip. */
+  /** Whether those grasp, the edge of their blade, and whether they burn: earlier poses have the same tip. */
   private grasps = false;
   private edgeM = "";
+  private burnS = 0;
 
   /** Sequence of the next pose. */
   private sequence: bigint;
@@ -74,7 +77,10 @@ export class Poses {
   message(lead: Lead, timeNs: bigint): MessageInitShape<typeof ToolPosesSchema> {
     const grasps = lead.grasps ?? false;
     const edgeM = String(lead.edgeM);
-    if (grasps !== this.grasps || edgeM !== this.edgeM) [this.grasps, this.edgeM, this.recent] = [grasps, edgeM, []];
+    const burnS = lead.burnS ?? 0;
+    if (grasps !== this.grasps || edgeM !== this.edgeM || burnS !== this.burnS) {
+      [this.grasps, this.edgeM, this.burnS, this.recent] = [grasps, edgeM, burnS, []];
+    }
     const newest = { sequence: this.sequence, timeNs, positionM: lead.positionM };
     const earlier = this.recent.flatMap((before) => earlierPose(newest, before));
     this.recent = [newest, ...this.recent].slice(0, this.maxEarlier);

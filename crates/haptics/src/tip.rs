@@ -86,6 +86,9 @@ pub struct Tip {
     /// The edge of a blade, from its tip to its heel, m, in the tissue's frame; in an instrument's tips, in the instrument's frame. 0
     /// for every other shape.
     pub edge_m: DVec3,
+    /// The time of contact after which it severs the tissue under its disc by heat (cautery), s; 0: it does not burn. Only discs on
+    /// sheets and surfaces burn.
+    pub burn_s: f64,
 }
 
 impl Tip {
@@ -96,7 +99,7 @@ impl Tip {
 }
 
 impl Default for Tip {
-    /// Returns the tip of a finger on wet tissue: a disc of 5 mm, μ = 0.2, no grasp, a constraint.
+    /// Returns the tip of a finger on wet tissue: a disc of 5 mm, μ = 0.2, no grasp, a constraint, no burning.
     fn default() -> Self {
         Tip {
             shape: TipShape::Disc,
@@ -105,6 +108,7 @@ impl Default for Tip {
             grasps: false,
             coupling: Coupling::Constraint,
             edge_m: DVec3::ZERO,
+            burn_s: 0.0,
         }
     }
 }

@@ -33,8 +33,8 @@ use palpate_haptics::pose_playback::{Path, PathState};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedPlan, SavedPoke, SavedTies, SavedTip, SavedTissue, TissueParts, ensure,
-    tool_above, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedBurns, SavedPlan, SavedPoke, SavedTies, SavedTip, SavedTissue, TissueParts,
+    ensure, tool_above, unsound,
 };
 use palpate_tissue::scene::record::Recovery;
 use palpate_tissue::{self as tissue, Model, Tissue};
@@ -286,10 +286,18 @@ impl Saved {
         let parts: Parts = match postcard::take_from_bytes(parts) {
             Ok((parts, [])) => parts,
             Ok((mut parts, rest)) => {
-                parts.tissue.ties = match postcard::take_from_bytes::<SavedTies>(rest) {
-                    Ok((ties, [])) if !ties.is_empty() => ties,
-                    _ => return Err(unsound("threads or clips that can't be read")),
+                let Ok((ties, rest)) = postcard::take_from_bytes::<SavedTies>(rest) else {
+                    return Err(unsound("threads or clips that can't be read"));
                 };
+                if rest.is_empty() {
+                    ensure(!ties.is_empty(), "threads or clips that can't be read")?;
+                } else {
+                    parts.tissue.burns = match postcard::take_from_bytes::<SavedBurns>(rest) {
+                        Ok((burns, [])) if !burns.is_empty() => burns,
+                        _ => return Err(unsound("burns that can't be read")),
+                    };
+                }
+                parts.tissue.ties = ties;
                 parts
             }
             Err(_) => return Err(unsound("parts that can't be read")),
@@ -321,8 +329,11 @@ fn checksum(header: &[u8], content: &[u8]) -> u128 {
 fn encoded(parts: &Parts, values: &[u8]) -> Vec<u8> {
     // Serialization of plain data to memory can't fail.
     let mut bytes_of_parts = postcard::to_stdvec(parts).unwrap_or_default();
-    if !parts.tissue.ties.is_empty() {
+    if !parts.tissue.ties.is_empty() || !parts.tissue.burns.is_empty() {
         bytes_of_parts.extend(postcard::to_stdvec(&parts.tissue.ties).unwrap_or_default());
+    }
+    if !parts.tissue.burns.is_empty() {
+        bytes_of_parts.extend(postcard::to_stdvec(&parts.tissue.burns).unwrap_or_default());
     }
     let parts = bytes_of_parts;
     let mut bytes = Vec::with_capacity(HEADER + parts.len() + values.len());

@@ -158,6 +158,9 @@ pub struct TissueParts {
     /// The threads and clips, which a snapshot keeps behind everything else.
     #[serde(skip)]
     pub ties: SavedTies,
+    /// What tips have burnt, behind these.
+    #[serde(skip)]
+    pub burns: SavedBurns,
 }
 
 /// The state that the guard goes back to.
@@ -420,10 +423,33 @@ pub struct SavedTip {
     friction: f64,
     /// 0 a disc that touches, 1 one that grasps, 2 a rigid disc, 3 a sphere, 4 a blade.
     kind: u8,
-    /// Stiffness, N/m, and damping, N·s/m, of a spring coupling; `None` for a constraint.
-    spring: Option<(f64, f64)>,
+    coupling: SavedCoupling,
     /// The edge of a blade, m.
     edge_m: Vector,
+}
+
+/// How a tip is coupled: stiffness, N/m, and damping, N·s/m, of a spring; and after which time of contact it severs, s. The first two
+/// have the bytes that an `Option` has: snapshots without tips that burn stay as they were before these.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+enum SavedCoupling {
+    Constraint,
+    Spring(f64, f64),
+    Burning(f64, Option<(f64, f64)>),
+}
+
+/// The time for which points have been under tips that burn, in steps: by place in memory, ascending. Now, and at the checkpoint. A
+/// snapshot without any has the bytes that it had before there were some.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SavedBurns {
+    pub(crate) now: Vec<(u32, u32)>,
+    pub(crate) at_checkpoint: Vec<(u32, u32)>,
+}
+
+impl SavedBurns {
+    /// Returns whether nothing is burnt.
+    pub fn is_empty(&self) -> bool {
+        self.now.is_empty() && self.at_checkpoint.is_empty()
+    }
 }
 
 /// Checks the parts of a snapshot when it is restored, against a tissue and the limits. All its refusals name
@@ -711,29 +737,41 @@ impl SavedTip {
     /// Converts a tip to plain data, without rounding.
     #[allow(clippy::cast_possible_truncation)]
     pub fn of(tip: &Tip) -> Self {
-        let Tip { shape, radius_m, friction, grasps, coupling, edge_m } = *tip;
+        let Tip { shape, radius_m, friction, grasps, coupling, edge_m, burn_s } = *tip;
         let spring = match coupling {
             Coupling::Constraint => None,
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Some((stiffness_n_per_m, damping_n_s_per_m)),
         };
+        let coupling = match spring {
+            spring if burn_s > 0.0 => SavedCoupling::Burning(burn_s, spring),
+            Some((stiffness_n_per_m, damping_n_s_per_m)) => SavedCoupling::Spring(stiffness_n_per_m, damping_n_s_per_m),
+            None => SavedCoupling::Constraint,
+        };
         let kind = TIP_KINDS.iter().position(|kind| *kind == (shape, grasps)).unwrap_or(0) as u8;
-        SavedTip { radius_m, friction, kind, spring, edge_m: edge_m.into() }
+        SavedTip { radius_m, friction, kind, coupling, edge_m: edge_m.into() }
     }
 
     /// Checks a saved tip against a tissue and returns it.
     ///
     /// # Errors
     /// Refuses a tip that a command may not have either ([`check_tip`]): a radius that is not above 0 or too large for
-    /// the tissue, a friction outside 0 to 10, or a coupling out of range. The field is that of `snapshot.tip`.
+    /// the tissue, a friction outside 0 to 10, or a coupling or a burning out of range. The field is that of `snapshot.tip`.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
-        let SavedTip { radius_m, friction, kind, spring, edge_m } = *self;
+        let SavedTip { radius_m, friction, kind, coupling, edge_m } = *self;
         let (shape, grasps) =
             TIP_KINDS.get(usize::from(kind)).copied().ok_or_else(|| unsound("an unknown kind of tip"))?;
+        let (burn_s, spring) = match coupling {
+            SavedCoupling::Constraint => (0.0, None),
+            SavedCoupling::Spring(stiffness_n_per_m, damping_n_s_per_m) => {
+                (0.0, Some((stiffness_n_per_m, damping_n_s_per_m)))
+            }
+            SavedCoupling::Burning(burn_s, spring) => (burn_s, spring),
+        };
         let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        let tip = Tip { shape, radius_m, friction, grasps, coupling, edge_m: checks.vector(edge_m)? };
+        let tip = Tip { shape, radius_m, friction, grasps, coupling, edge_m: checks.vector(edge_m)?, burn_s };
         check_tip("snapshot.tip", checks.shape, &tip)?;
         Ok(tip)
     }

@@ -271,9 +271,9 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
                     (Some(stiffness_n_per_m), damping_n_s_per_m)
                 }
             };
-            let Tip { shape, radius_m, friction, grasps, edge_m, .. } = *tip;
+            let Tip { shape, radius_m, friction, grasps, edge_m, burn_s, .. } = *tip;
             let (shape, edge_m) = (shape as u32, vector(edge_m).filter(|_| edge_m != DVec3::ZERO));
-            let tip = pb::Tip { radius_m, friction, grasps, spring_n_per_m, spring_n_s_per_m, shape, edge_m };
+            let tip = pb::Tip { radius_m, friction, grasps, spring_n_per_m, spring_n_s_per_m, shape, edge_m, burn_s };
             let is_same = tips.insert(command.tool, tip) == Some(tip);
             Message::Pose(pb::Pose {
                 place_m: vector(*place_m),
@@ -381,6 +381,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
                     grasps: tip.grasps,
                     coupling,
                     edge_m: from_vector(tip.edge_m.as_ref()),
+                    burn_s: tip.burn_s,
                 },
             }
         }

@@ -101,10 +101,28 @@ fn check_edge(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
 /// Largest radius of a bite, in distances between points: a session may have a thousand of them.
 const MAX_BITE_EDGES: f64 = 8.0;
 
+/// The longest time of contact that a tip may take to sever, s.
+const MAX_BURN_S: f64 = 3600.0;
+
+/// Checks that a tip that burns is a disc on a sheet or a surface.
+fn check_burning(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
+    let field = format!("{field}.burn_s");
+    let range = format!("from 0 to {MAX_BURN_S}");
+    number(&field, tip.burn_s, &range, |burn_s| (0.0..=MAX_BURN_S).contains(&burn_s))?;
+    let refuse = |text: &str| Err(Refusal::new(Reason::WrongKind, field.clone(), text));
+    if tip.burn_s > 0.0 && shape.takes_rigid_tips() {
+        return refuse("is for a sheet or a surface: a solid is not burnt");
+    }
+    if tip.burn_s > 0.0 && tip.shape != TipShape::Disc {
+        return refuse("is for a \"disc\": other tips do not burn");
+    }
+    Ok(())
+}
+
 /// Least radius of a rigid tip, in edges of a cell.
 const MIN_RIGID_RADIUS: f64 = 0.25;
 
-/// Checks that a tip suits the tissue: radius, friction and coupling.
+/// Checks that a tip suits the tissue: radius, friction, coupling, edge and burning.
 ///
 /// # Errors
 /// Refuses a value that is not finite or out of range: a radius must be above 0 and at most the tissue's
@@ -134,6 +152,7 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         }
     }
     check_edge(field, shape, tip)?;
+    check_burning(field, shape, tip)?;
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
         let field = format!("{field}.spring");
         physical(&format!("{field}.stiffness_n_per_m"), stiffness_n_per_m)?;

@@ -810,6 +810,7 @@ fn tip_of(fields: &mut Fields<'_>, standard: Tip) -> Result<Tip> {
         grasps: fields.item("grasps").map_or(Ok(standard.grasps), |item| item.flag())?,
         coupling,
         edge_m: standard.edge_m,
+        burn_s: fields.number("burn_s")?.unwrap_or(standard.burn_s),
     })
 }
 

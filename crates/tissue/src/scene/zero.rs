@@ -100,8 +100,8 @@ impl Action {
                         damping_n_s_per_m: unsigned_zero(damping_n_s_per_m),
                     },
                 };
-                let (radius_m, friction) = (unsigned_zero(tip.radius_m), unsigned_zero(tip.friction));
-                let tip = Tip { radius_m, friction, coupling, edge_m: unsigned(tip.edge_m), ..tip };
+                let [radius_m, friction, burn_s] = [tip.radius_m, tip.friction, tip.burn_s].map(unsigned_zero);
+                let tip = Tip { radius_m, friction, coupling, edge_m: unsigned(tip.edge_m), burn_s, ..tip };
                 let velocity_m_per_s = velocity_m_per_s.map(unsigned);
                 Action::Pose { place_m: unsigned(place_m), velocity_m_per_s, tip }
             }

@@ -23,7 +23,6 @@ use crate::state::guard::work_account::WorkAccount;
 use crate::state::restore::TypedState;
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
-use crate::tools::contact::Contacts;
 
 /// Size of a slice of an audit, in points times substeps; a slice takes a few milliseconds.
 const SLICE: u64 = 1 << 20;
@@ -48,7 +47,7 @@ impl<T: Real> TissueState<T> {
             state: self.copied_state(),
             applied: Applied::<T>::like(&self.applied),
             prescribed: self.prescribed.clone(),
-            contacts: Contacts { ties: self.contacts.ties.clone(), ..Contacts::default() },
+            contacts: self.contacts.without_tools(),
             steps: self.steps,
             work: WorkAccount::default(),
             checkpoint: None,
@@ -80,6 +79,7 @@ impl<T: Real> TissueState<T> {
             prescribed: self.prescribed.saved(),
             contacts: self.contacts.saved(),
             ties: self.contacts.ties.saved(),
+            burns: self.contacts.burns.saved(),
             work: self.work,
             checkpoint: self.checkpoint.clone(),
             inputs: self.inputs.clone(),

@@ -1,4 +1,4 @@
-//! What is severed in a step: by the edges of blades, and by strain (`tearing`).
+//! What is severed in a step: by the edges of blades, by heat (`burning`), and by strain (`tearing`).
 //!
 //! In a step the edge of a blade sweeps a surface, from the line between its tip and its heel at the step's beginning to that at
 //! the step's end: two triangles. A spring that crosses one of them is severed. The tissue moves as well, so the edge
@@ -19,7 +19,7 @@
 
 use glam::DVec3;
 
-use crate::body::model::displacement_m;
+use crate::body::model::{Model, displacement_m};
 use crate::body::severed::SeveredSpring;
 use crate::body::spring_ends::SpringEnd;
 use crate::body::spring_search::SpringSearch;
@@ -83,12 +83,25 @@ impl EdgeSweep {
     }
 }
 
-/// A spring that a blade crosses.
+/// A spring that is severed, by its first end, and at which part of the way to the other.
 #[derive(Debug, Clone, Copy)]
 struct Crossing {
     place: usize,
     spring: SpringEnd,
     part: f64,
+}
+
+impl Crossing {
+    /// Returns a spring that is severed in its middle, from its first end; `place` is one of both.
+    fn in_middle(model: &Model, place: usize, spring: SpringEnd) -> Self {
+        let part = 0.5;
+        if spring.other > place {
+            return Crossing { place, spring, part };
+        }
+        let number = model.number_at_other_end(place, spring.number);
+        let other = SpringEnd { number, other: place, rest: -spring.rest, ..spring };
+        Crossing { place: spring.other, spring: other, part }
+    }
 }
 
 impl<T: Real> TissueState<T> {
@@ -100,11 +113,12 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// Severs the springs that blades cross in this step, and those that tear.
+    /// Severs the springs that blades cross in this step, those that burn through, and those that tear.
     pub(super) fn cut(&mut self) {
+        let burnt = self.burnt();
         let blades = self.contacts.tools.iter().filter(|tool| tool.tip.shape == TipShape::Blade);
         let sweeps: Vec<EdgeSweep> = blades.map(EdgeSweep::of).collect();
-        if sweeps.is_empty() && self.model.scene.cutting.tear_strain.is_none() {
+        if sweeps.is_empty() && burnt.is_empty() && self.model.scene.cutting.tear_strain.is_none() {
             return;
         }
         if !sweeps.is_empty() {
@@ -113,6 +127,7 @@ impl<T: Real> TissueState<T> {
         let crossed =
             |sweep| if self.model.places.solid().is_some() { self.crossed_faces(sweep) } else { self.crossed(sweep) };
         let mut crossings: Vec<Crossing> = sweeps.iter().flat_map(crossed).collect();
+        crossings.extend(burnt);
         crossings.extend(self.torn());
         crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
         crossings.dedup_by_key(|crossing| (crossing.place, crossing.spring.number));
@@ -273,6 +288,7 @@ impl<T: Real> TissueState<T> {
     }
 }
 
+mod burning;
 mod faces;
 mod tearing;
 #[cfg(test)]

@@ -43,7 +43,6 @@ use crate::state::guard::{
 };
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
-use crate::tools::contact::Contacts;
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::Prescribed;
 use crate::tools::tie::Ties;
@@ -207,7 +206,7 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Goes back to the checkpoint, with the substep of `halvings`.
-    fn go_back(&mut self, halvings: u32) {
+    pub(super) fn go_back(&mut self, halvings: u32) {
         // Without a checkpoint there is nothing to go back to.
         let Some(checkpoint) = &self.checkpoint else { return };
         self.audit_window.give_up();
@@ -348,7 +347,8 @@ impl<T: Real> TissueState<T> {
         if at_rest {
             // Also discards what the end of a force or a grasp would add to the next substep.
             self.state = State::at_rest(&self.tables.layout, self.state.kept.len());
-            (self.applied, self.prescribed, self.contacts) = (Applied::new(), Prescribed::new(), Contacts::default());
+            (self.applied, self.prescribed) = (Applied::new(), Prescribed::new());
+            self.contacts = self.contacts.without_tools();
             self.follow_cuts();
         }
         // They may be what the tissue did not bear.

@@ -17,8 +17,8 @@ use crate::kernel::region::sides_of;
 use crate::limits::Limits;
 use crate::memory;
 use crate::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedInput, SavedPrescribed, SavedState,
-    SavedTie, SavedTies, TissueParts, ensure, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedBurns, SavedCheckpoint, SavedContact, SavedForces, SavedInput, SavedPrescribed,
+    SavedState, SavedTie, SavedTies, TissueParts, ensure, unsound,
 };
 use crate::scene::{Named, Precision};
 use crate::state::guard::checkpoint::Checkpoint;
@@ -27,6 +27,7 @@ use crate::state::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
 use crate::state::sleep::tiles::TakenTiles;
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::Applied;
+use crate::tools::burns::Burns;
 use crate::tools::contact::Contacts;
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::Prescribed;
@@ -135,6 +136,7 @@ pub(super) struct TypedState<T: Real> {
     pub(super) prescribed: SavedPrescribed,
     pub(super) contacts: Vec<SavedContact>,
     pub(super) ties: Vec<SavedTie>,
+    pub(super) burns: Vec<(u32, u32)>,
     pub(super) work: WorkAccount,
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     pub(super) inputs: Vec<(u64, usize, ToolInput)>,
@@ -194,6 +196,10 @@ impl<T: Real> SavedState for TypedState<T> {
                 now: self.ties.clone(),
                 at_checkpoint: self.checkpoint.as_ref().map_or_else(Vec::new, |from| from.contacts.ties.saved()),
             },
+            burns: SavedBurns {
+                now: self.burns.clone(),
+                at_checkpoint: self.checkpoint.as_ref().map_or_else(Vec::new, |from| from.contacts.burns.saved()),
+            },
         };
         PlainTissue { parts, values }
     }
@@ -240,6 +246,7 @@ fn restored_as<T: Real>(
     sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
     sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
     sheet.contacts = Contacts::restored((&parts.contacts, &parts.ties.now), model, &checks)?;
+    sheet.contacts.burns = Burns::restored(&parts.burns.now, model)?;
     sheet.work = WorkAccount::restored(&parts.work)?;
     sheet.tiles.restore(&parts.tiles)?;
     let cuts = Cuts::restored(&parts.severed, parts.topology_version, model)?;
@@ -279,7 +286,7 @@ fn restored_as<T: Real>(
     let checkpoint = parts.checkpoint.as_ref().map(|saved| {
         let mut state = State::zero(&layout, sheet.state.kept.len());
         fill(&mut state)?;
-        checkpoint_of(&sheet, (saved, &parts.ties.at_checkpoint), state, &checks)
+        checkpoint_of(&sheet, (saved, &parts.ties.at_checkpoint, &parts.burns.at_checkpoint), state, &checks)
     });
     sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
     sheet.tiles.remember_again(&mut values)?;
@@ -303,7 +310,7 @@ fn restored_as<T: Real>(
 
 fn checkpoint_of<T: Real>(
     tissue: &TissueState<T>,
-    (saved, ties): (&SavedCheckpoint, &[SavedTie]),
+    (saved, ties, burns): (&SavedCheckpoint, &[SavedTie], &[(u32, u32)]),
     state: State<T>,
     checks: &Checks<'_>,
 ) -> Result<Checkpoint<T>> {
@@ -317,6 +324,7 @@ fn checkpoint_of<T: Real>(
     let scale = halved(model, saved.halvings).force_scale(&model.scene);
     let cuts = tissue.tables.severed.first(severed, model);
     let mut contacts = Contacts::restored((&saved.contacts, ties), model, checks)?;
+    contacts.burns = Burns::restored(burns, model)?;
     let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
     contacts.follow_cuts(model, cuts.copies());
     if let Some(copies) = cuts.copies() {

@@ -423,6 +423,7 @@ impl<T: Real> Tissue for TissueState<T> {
         if blocks.start == 0 {
             self.tables.severed.hash(hasher);
             self.contacts.ties.hash(&mut |bytes| hasher.update(bytes));
+            self.contacts.burns.hash(&mut |bytes| hasher.update(bytes));
         }
         self.state.hash_blocks(&self.tables.layout, |point| self.tiles.has_moved(point), blocks, hasher);
     }

@@ -61,6 +61,7 @@ use crate::kernel::real::Real;
 use crate::response::tangent::{LinearPatch, Tangent};
 use crate::saved::{Checks, SavedContact, SavedSide, SavedTie, SavedTip, ensure};
 use crate::scene::tie::Tie;
+use crate::tools::burns::Burns;
 use crate::tools::rigid_tip::RigidTip;
 use crate::tools::tie::Ties;
 use palpate_haptics::{ContactState, Coupling, Tip};
@@ -173,12 +174,13 @@ fn rigid_tip(tip: Tip) -> Option<RigidTip> {
     tip.shape.is_rigid().then(|| RigidTip::new(tip))
 }
 
-/// All position-controlled tools, and the threads and clips, which hold discs as they do.
+/// All position-controlled tools, the threads and clips, which hold discs as they do, and what tips have burnt.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Contacts {
     /// By ascending number.
     pub(crate) tools: Vec<Tool>,
     pub(crate) ties: Ties,
+    pub(crate) burns: Burns,
     /// The corners of a solid that cuts have doubled.
     pub(crate) copies: Option<Arc<CornerCopies>>,
 }
@@ -237,7 +239,7 @@ impl Contacts {
     ) -> Result<Self> {
         let tools: Vec<Tool> = saved.iter().map(|tool| Tool::restored(tool, model, checks)).collect::<Result<_>>()?;
         ensure(tools.is_sorted_by(|a, b| a.number < b.number), "tools out of order")?;
-        Ok(Contacts { tools, ties: Ties::restored(ties, model, checks)?, copies: None })
+        Ok(Contacts { tools, ties: Ties::restored(ties, model, checks)?, ..Contacts::default() })
     }
 
     /// Lays, changes or with `None` removes a thread or clip ([`Ties::set`]).
@@ -261,6 +263,11 @@ impl Contacts {
             }
         }
         self.ties.follow_cuts(model, copies);
+    }
+
+    /// Returns the threads and clips and what is burnt, without tools.
+    pub(crate) fn without_tools(&self) -> Self {
+        Contacts { ties: self.ties.clone(), burns: self.burns.clone(), ..Contacts::default() }
     }
 
     /// Returns whether there are neither tools nor threads and clips.

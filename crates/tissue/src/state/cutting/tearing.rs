@@ -18,9 +18,6 @@ use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
 use crate::state::tissue_state::TissueState;
 
-/// Where a spring tears: in its middle.
-const PART: f64 = 0.5;
-
 impl<T: Real> TissueState<T> {
     /// Returns the springs that tear at the end of a step, and those that resist bending and go with them.
     pub(super) fn torn(&self) -> Vec<Crossing> {
@@ -76,13 +73,7 @@ impl<T: Real> TissueState<T> {
                         if is_severed || !model.joins_neighbours(place, &spring) {
                             return;
                         }
-                        let (first, spring) = if is_first {
-                            (place, spring)
-                        } else {
-                            let number = model.number_at_other_end(place, spring.number);
-                            (spring.other, SpringEnd { number, other: place, rest: -spring.rest, ..spring })
-                        };
-                        found.push((excess, Crossing { place: first, spring, part: PART }));
+                        found.push((excess, Crossing::in_middle(model, place, spring)));
                     });
                 }
             }
@@ -91,7 +82,7 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Returns the whole springs that resist bending and whose ends no two whole springs in a row join, once `torn` are severed.
-    fn unspanned(&self, torn: &[Crossing]) -> Vec<Crossing> {
+    pub(super) fn unspanned(&self, torn: &[Crossing]) -> Vec<Crossing> {
         let TissueState { model, tables, .. } = self;
         let is_torn = |place: usize, spring: &SpringEnd| {
             let ends = [place.min(spring.other), place.max(spring.other)];
@@ -113,13 +104,7 @@ impl<T: Real> TissueState<T> {
                 if joined(spring.other).iter().any(|between| own.contains(between)) {
                     continue;
                 }
-                let (first, spring) = if spring.other > place {
-                    (place, spring)
-                } else {
-                    let number = model.number_at_other_end(place, spring.number);
-                    (spring.other, SpringEnd { number, other: place, rest: -spring.rest, ..spring })
-                };
-                found.push(Crossing { place: first, spring, part: PART });
+                found.push(Crossing::in_middle(model, place, spring));
             }
         }
         found

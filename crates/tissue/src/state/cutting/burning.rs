@@ -1,0 +1,50 @@
+//! Cautery: the springs that have been for long enough under a tip that burns.
+//!
+//! A tip burns the points that its disc covers, the same that it presses or holds, for as long as it touches or holds them. Their times of contact
+//! add up, under one tip or several, and stay when the tip goes. A spring is severed in its middle once both of its ends have burnt
+//! for as long as the tip that is at one of them takes (`Tip::burn_s`), and springs that resist bending go as in a tear
+//! (`tearing`). Before that, the tissue does not become stiffer.
+
+use std::collections::BTreeSet;
+
+use super::Crossing;
+use crate::kernel::real::Real;
+use crate::state::tissue_state::TissueState;
+use palpate_haptics::ContactState;
+
+impl<T: Real> TissueState<T> {
+    /// Burns what lies under tips that burn for a step. Returns the whole springs that this severs; some perhaps twice.
+    pub(super) fn burnt(&mut self) -> Vec<Crossing> {
+        let TissueState { model, tables, contacts, .. } = self;
+        let burning = contacts.tools.iter().filter(|tool| tool.tip.burn_s > 0.0);
+        let touching = burning.filter(|tool| tool.contact_state != ContactState::Free);
+        let under: Vec<(f64, Vec<usize>)> = touching
+            .map(|tool| (tool.tip.burn_s, tool.points().map(|point| model.index_of(point)).collect()))
+            .collect();
+        if under.is_empty() {
+            return Vec::new();
+        }
+        let burns = &mut contacts.burns;
+        // A point under two tips burns once.
+        let places: BTreeSet<usize> = under.iter().flat_map(|(_, places)| places).copied().collect();
+        places.into_iter().for_each(|place| burns.add_step(place));
+        let mut found = Vec::new();
+        for (burn_s, places) in under {
+            let is_through = |place| f64::from(burns.steps_at(place)) / model.scene.stepping.rate_hz >= burn_s;
+            for place in places.into_iter().filter(|place| is_through(*place)) {
+                let first_end = model.first_end(place);
+                model.each_spring(place, |spring| {
+                    if is_through(spring.other) && !tables.severed.has(first_end + spring.number) {
+                        found.push(Crossing::in_middle(model, place, spring));
+                    }
+                });
+            }
+        }
+        let bending = self.unspanned(&found);
+        found.extend(bending);
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests;
