@@ -161,7 +161,6 @@ impl Ties {
         };
         let is_clip = |tie: &Tie| tie.kind == TieKind::Clip;
         if let Ok(index) = found
-            && !self.laid[index].is_broken
             && self.laid[index].tie.bites == tie.bites
             && is_clip(&self.laid[index].tie) == is_clip(&tie)
         {
