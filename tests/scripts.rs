@@ -437,7 +437,7 @@ fn a_tip_of_a_script_burns_through_what_it_touches_for_long_enough() {
     assert!(severed(0.2, 0.25) > 20);
     assert_eq!([severed(0.201, 0.25), severed(0.2, 0.249), severed(0.0, 0.4)], [0, 0, 0]);
     for (tip, expected) in [
-        ("burn_s = -1.0", "tool[0].tip.burn_s: is -1, but must be from 0 to 3600"),
+        ("burn_s = -1.0", "tool[0].tip.burn_s: must be from 0 to 3600, but is -1"),
         ("burn_s = 3601.0", "tool[0].tip.burn_s"),
         ("burn_s = \"1 s\"", "tool[0].tip.burn_s"),
     ] {
@@ -469,7 +469,8 @@ fn a_burn_is_part_of_a_snapshot_and_of_a_continued_session() {
             .map(|(tool, action)| Due::in_time(Command::new(tool as u32, Some(step + 1), action)));
         again.advance(&mut due.collect::<Vec<_>>(), |_| {});
         simulation.step(0).unwrap();
-        assert_eq!(again.tissue().cuts().is_empty(), step < 249, "after step {step}");
+        // It touches at the end of the fiftieth step for the first time, and burns through in the 200th from there on.
+        assert_eq!(again.tissue().cuts().is_empty(), step < 248, "after step {step}");
     }
     assert_eq!(again.tissue().state_hash(), simulation.session.tissue().state_hash());
 }

@@ -266,7 +266,8 @@ impl<T: Real> SleepTiles<T> {
         if places.iter().any(|place| !place.is_empty()) {
             self.remember();
         }
-        for place in places {
+        // A tile that nothing watches remembers nothing, and there may be no other.
+        for place in places.into_iter().filter(|place| !place.is_empty()) {
             for value in &mut self.snapshots[place] {
                 *value = values.next().ok_or_else(|| unsound("too few values"))?;
                 ensure(value.is_finite(), "a value that is not finite")?;
