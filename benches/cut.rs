@@ -51,6 +51,7 @@ fn main() {
         ("liver", &[][..]),
         ("liver", &["sheet.points=[121, 121]", "sheet.spacing_m=0.000625"]),
         ("liver-organ", &["mesh.organ.edge_m=0.002"]),
+        ("liver-solid", &["solid.cell_m=0.0035"]),
     ] {
         let model = model(name, &[&["sleep.tolerance=0"], sets].concat());
         let tip = Tip { shape: TipShape::Blade, radius_m: 0.001, edge_m: 0.03 * DVec3::Z, ..Tip::default() };

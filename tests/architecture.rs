@@ -622,6 +622,7 @@ fn unsafe_code_is_where_vectors_are() {
         ("crates/tissue", "body/surface/mesh_calibration.rs"),
         ("crates/tissue", "body/surface/pressure.rs"),
         ("crates/tissue", "body/sheet/falloff.rs"),
+        ("crates/tissue", "body/solid/cut_cubes.rs"),
         ("crates/tissue", "body/solid/sweep.rs"),
         ("crates/tissue", "body/solid/tests.rs"),
         ("crates/tissue", "body/sheet/grid.rs"),

@@ -226,7 +226,10 @@ impl Places {
         match self {
             Places::Sheet(points) => points.fall_off(width, poke, layout, [rows, columns], factors, spans),
             Places::Surface(places) => places.fall_off(poke, layout, rows, factors, spans),
-            Places::Solid(places) => places.fall_off((poke, copies), layout, [rows, columns], factors, spans),
+            Places::Solid(places) => {
+                let corner_of = |place: usize| copies.map_or(place, |copies| copies.corner_of(place));
+                places.fall_off(poke, corner_of, layout, [rows, columns], factors, spans);
+            }
         }
     }
 

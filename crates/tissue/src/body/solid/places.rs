@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::body::solid::corner_copies::CornerCopies;
 use crate::body::tile_links::TileLinks;
 use crate::kernel::field::{BLOCK, Field, Layout};
 use crate::kernel::real::Real;
@@ -257,10 +256,12 @@ impl SolidPlaces {
     }
 
     /// Writes the falloff of `poke`, e^(−c·r) divided by the relative mass, over some rows and columns, and which part of
-    /// each row is not 0. A copy of a corner has the factor of the corner: so the force divides among them as the mass does.
+    /// each row is not 0. `corner_of` gives the corner of a place: a copy has the factor of its
+    /// corner, so the force divides among them as the mass does.
     pub(crate) fn fall_off<T: Real>(
         &self,
-        (poke, copies): (&Poke, Option<&CornerCopies>),
+        poke: &Poke,
+        corner_of: impl Fn(usize) -> usize,
         layout: &Layout,
         [rows, columns]: [Range<usize>; 2],
         factors: &mut Field<T>,
@@ -271,8 +272,7 @@ impl SolidPlaces {
         for (factors, row) in factors.chunks_exact_mut(layout.stride).zip(rows) {
             let (mut first, mut end) = (usize::MAX, 0);
             for column in columns.clone() {
-                let place = row * layout.columns + column;
-                let place = copies.map_or(place, |copies| copies.corner_of(place));
+                let place = corner_of(row * layout.columns + column);
                 let mass = self.mass(place);
                 if mass == 0.0 {
                     factors[column] = T::default();
