@@ -43,6 +43,8 @@ export interface Reach {
 export class Hand {
   /** Strength, 0 to 1. */
   strength = 0.5;
+  /** How often it has begun to press. */
+  presses = 0;
   readonly grasper: Grasper;
   onChange: () => void = () => {};
   /** Called with samples of the hand's tools that arrived by datagram. */
@@ -177,6 +179,7 @@ export class Hand {
 
   /** Begins to touch at `place`, which is now at `onSurfaceM`. */
   async press(place: Place, onSurfaceM: Vec3, view: View): Promise<void> {
+    this.presses++;
     this.isLeft = false;
     this.place = place;
     this.onSurfaceM = onSurfaceM;

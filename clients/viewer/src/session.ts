@@ -95,6 +95,8 @@ export class ShownSession {
   private frame: FrameTold | undefined;
   /** Simulated time of the last change of the topology, s. */
   private cutS = -Infinity;
+  /** The hand and the press with which this page cut then; undefined if it did not. */
+  private cutDrag: string | undefined;
   /** Who has cut while this page looked on. */
   readonly cutters = new Set<string>();
 
@@ -269,8 +271,12 @@ export class ShownSession {
     const { frame: before, session } = this;
     this.frame = frame;
     if (!before || frame.topologyVersion <= before.topologyVersion) return;
-    const isNew = frame.timeS - this.cutS > ONE_CUT_S;
-    this.cutS = frame.timeS;
+    // A drag is one cut, however long it rests between.
+    const press = this.hands.both.findIndex((hand) => hand.mode === "blade" && hand.holds);
+    const drag = press < 0 ? undefined : `${press} ${this.hands.both[press]!.presses}`;
+    const isSameDrag = drag !== undefined && drag === this.cutDrag;
+    const isNew = frame.timeS - this.cutS > ONE_CUT_S && !isSameDrag;
+    [this.cutS, this.cutDrag] = [frame.timeS, drag];
     if (isNew && session.journal && !session.playback) {
       this.beforeCuts.push({ sessionId: session.sessionId, run: session.journal.run, step: before.step });
     }
