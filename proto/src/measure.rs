@@ -12,7 +12,7 @@ use palpate_refusal::{Reason, Refusal, Result};
 pub const MULTIPLE: usize = 32;
 
 /// Memory that a message may take regardless of its length, bytes: more than a full batch of short commands.
-pub const ROOM: usize = 2 << 20;
+pub const ROOM: usize = 3 << 20;
 
 /// Number of nested levels that are measured: more than any message has.
 const LEVELS: u32 = 16;
