@@ -151,7 +151,7 @@ fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
 }
 
 /// Returns the message for a script's command to tool `tool`, which acts at step `at_step`. Its sequence number is
-/// `at_step` + 1, and it has no time to live. `client_time_ns` is the client time, ns, or 0. `shape` is the rest
+/// `at_step` + 1 (a thread's has none), and it has no time to live. `client_time_ns` is the client time, ns, or 0. `shape` is the rest
 /// shape of the tissue.
 #[allow(clippy::cast_possible_truncation)]
 pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
@@ -186,6 +186,8 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
         Action::Tie { number, tie: laid } => Message::Tie(tie(*number, laid.as_ref())),
         Action::Release => Message::Release(pb::Release {}),
     };
-    let (tool, sequence, action) = (tool as u32, Some(at_step + 1), Some(action));
+    // A tool lays several threads in a step; only commands of which the last counts are numbered by steps.
+    let sequence = (!matches!(action, Message::Tie(_))).then_some(at_step + 1);
+    let (tool, action) = (tool as u32, Some(action));
     pb::Command { tool, sequence, client_time_ns, at_step: Some(at_step), time_to_live_s: None, action }
 }
