@@ -63,6 +63,7 @@ async fn a_thread_over_the_network_has_the_bits_of_a_script_and_stays_when_its_t
     // The thread holds on without its tool: the tissue stays away from rest.
     drop(touch);
     server.start_until(&session, 600).await;
+    server.hash_at(&session, 600).await;
     let bytes = {
         let request = pb::SaveSnapshotRequest { session_id: session.clone() };
         let parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
