@@ -56,13 +56,17 @@ impl SpringSearch {
         }
         let [rows, columns] = sides_of(layout, tile);
         // A lane for each column: only then does the compiler compare a row at once.
+        #[allow(clippy::needless_range_loop)]
         let bounds = |c: usize| {
             let (mut low, mut high) = ([T::default(); TILE], [T::default(); TILE]);
             for i in rows.clone() {
                 let row = &state.u[c * layout.plane + i * layout.stride..][columns.clone()];
-                for ((value, low), high) in row.iter().zip(&mut low).zip(&mut high) {
-                    *low = if *value < *low { *value } else { *low };
-                    *high = if *value > *high { *value } else { *high };
+                let (low, high) = (&mut low[..row.len()], &mut high[..row.len()]);
+                // Not zipped: the compiler calls a function for each row then.
+                for lane in 0..row.len() {
+                    let value = row[lane];
+                    low[lane] = if value < low[lane] { value } else { low[lane] };
+                    high[lane] = if value > high[lane] { value } else { high[lane] };
                 }
             }
             let low = low.iter().map(|value| value.wide()).fold(0.0, f64::min);
