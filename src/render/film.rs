@@ -8,10 +8,10 @@ use palpate_session::Session;
 use palpate_session::simulation::{Simulation, SimulationFailure};
 use palpate_session::surface::{Skin, Snapshot, Wound};
 use palpate_texture::Image;
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::{Cuts, Model};
 
 /// A script that is played on a session of its own, step by step and only forwards, to make pictures of it.
 pub struct Film<'a> {
@@ -23,7 +23,6 @@ pub struct Film<'a> {
 /// The tissue at one moment, and the forces that act on it: all that a picture needs besides the model and the view.
 pub struct Still {
     snapshot: Snapshot,
-    cuts: Cuts,
     shown: Option<Arc<Skin>>,
     arrows: Vec<Arrow>,
 }
@@ -86,11 +85,10 @@ impl Still {
     pub fn of(session: &Session, shown: Option<&Arc<Skin>>, arrows: Vec<Arrow>) -> Self {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         session.tissue().shown_displacements_m(&mut displacement_m);
-        let cuts = session.tissue().cuts();
         let snapshot = Snapshot::new(&session.model().scene, session.step_count(), session.time_s(), displacement_m)
             .with_skin(shown)
-            .with_cuts(cuts.clone());
-        Still { snapshot, cuts, shown: shown.cloned(), arrows }
+            .with_cuts(session.tissue().cuts());
+        Still { snapshot, shown: shown.cloned(), arrows }
     }
 
     /// Returns the simulated time, s.
@@ -101,7 +99,7 @@ impl Still {
     /// Draws the tissue as seen by `view`, as [`picture`] does. `model` must be that of the session.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
         let shown = self.shown.as_deref();
-        let wound = Wound::of(model, &self.cuts, shown, view.refinement);
+        let wound = Wound::of(model, self.snapshot.cuts(), shown, view.refinement);
         picture(model.shape(), shown, &self.snapshot, wound.as_ref(), &self.arrows, view)
     }
 }

@@ -38,15 +38,12 @@ impl TopologyParts {
         }
     }
 
-    /// Returns the next message; the last one has `last` set.
-    pub(super) fn next(&mut self) -> pb::GetTopologyResponse {
-        pb::GetTopologyResponse {
-            version: self.version,
-            continues: self.continues,
-            severed: self.springs.by_ref().take(SPRINGS_PER_MESSAGE).collect(),
-            pieces: self.pieces,
-            last: self.springs.len() == 0,
-        }
+    /// Returns the next message, and whether it is the last, which has `last` set.
+    pub(super) fn next(&mut self) -> (pb::GetTopologyResponse, bool) {
+        let severed = self.springs.by_ref().take(SPRINGS_PER_MESSAGE).collect();
+        let last = self.springs.len() == 0;
+        let TopologyParts { version, continues, pieces, .. } = *self;
+        (pb::GetTopologyResponse { version, continues, severed, pieces, last }, last)
     }
 }
 

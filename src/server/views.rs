@@ -67,6 +67,21 @@ impl ViewStream {
     }
 }
 
+/// Sends the messages of an answer; `next` returns the next one and whether it is the last. `guard` is that of the stream.
+fn in_parts<P: Send + 'static, M: Send + 'static>(
+    parts: P,
+    guard: StreamGuard,
+    next: fn(&mut P) -> (M, bool),
+) -> ViewMessages<M> {
+    let cut = guard.cut().clone();
+    let out = stream::unfold(Some((parts, guard)), move |rest| async move {
+        let (mut parts, guard) = rest?;
+        let (message, last) = next(&mut parts);
+        Some((Ok(message), (!last).then_some((parts, guard))))
+    });
+    until_cut(out, cut)
+}
+
 #[tonic::async_trait]
 impl ViewService for Views {
     type GetMeshStream = ViewMessages<pb::GetMeshResponse>;
@@ -97,16 +112,9 @@ impl ViewService for Views {
         let pb::GetTopologyRequest { session_id, since_version } = request.into_inner();
         let handle = self.0.session(&session_id).await?;
         let guard = handle.open_stream("GetTopology", StreamKind::ReadsOnly, &account)?;
-        let cut = guard.cut().clone();
         let parts = move |_: &CancelFlag| TopologyParts::new(&handle, since_version);
-        let begin = Some((self.0.job_pool.work(&account, parts).await?, guard));
-        let out = stream::unfold(begin, |rest| async move {
-            let (mut parts, guard) = rest?;
-            let message = parts.next();
-            let last = message.last;
-            Some((Ok(message), (!last).then_some((parts, guard))))
-        });
-        Ok(Response::new(until_cut(out, cut)))
+        let parts = self.0.job_pool.work(&account, parts).await?;
+        Ok(Response::new(in_parts(parts, guard, TopologyParts::next)))
     }
 
     async fn get_wound(&self, request: Request<pb::GetWoundRequest>) -> Result<Response<Self::GetWoundStream>, Status> {
@@ -115,16 +123,9 @@ impl ViewService for Views {
         let handle = self.0.session(&session_id).await?;
         let grid = Refinement::new(&handle.model.scene, refinement, &self.0.config.limits)?;
         let guard = handle.open_stream("GetWound", StreamKind::ReadsOnly, &account)?;
-        let cut = guard.cut().clone();
         let parts = move |_: &CancelFlag| WoundParts::new(&handle, grid, since_version);
-        let begin = Some((self.0.job_pool.work(&account, parts).await?, guard));
-        let out = stream::unfold(begin, |rest| async move {
-            let (mut parts, guard) = rest?;
-            let message = parts.next();
-            let last = message.last;
-            Some((Ok(message), (!last).then_some((parts, guard))))
-        });
-        Ok(Response::new(until_cut(out, cut)))
+        let parts = self.0.job_pool.work(&account, parts).await?;
+        Ok(Response::new(in_parts(parts, guard, WoundParts::next)))
     }
 
     async fn get_texture(

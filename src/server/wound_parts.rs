@@ -42,13 +42,13 @@ impl WoundParts {
         WoundParts { common, vertices: wound.vertices.into_iter(), triangles: wound.triangles.into_iter() }
     }
 
-    /// Returns the next message; the last one has `last` set.
-    pub(super) fn next(&mut self) -> pb::GetWoundResponse {
+    /// Returns the next message, and whether it is the last, which has `last` set.
+    pub(super) fn next(&mut self) -> (pb::GetWoundResponse, bool) {
         let vertices: Vec<_> = self.vertices.by_ref().take(ENTRIES_PER_MESSAGE).map(lip_vertex).collect();
         let room = ENTRIES_PER_MESSAGE - vertices.len();
         let triangles: Vec<_> = self.triangles.by_ref().take(room).map(cut_triangles).collect();
         let last = self.vertices.len() == 0 && self.triangles.len() == 0;
-        pb::GetWoundResponse { vertices, triangles, last, ..self.common.clone() }
+        (pb::GetWoundResponse { vertices, triangles, last, ..self.common.clone() }, last)
     }
 }
 

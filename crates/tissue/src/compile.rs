@@ -349,6 +349,29 @@ impl Model {
     }
 }
 
+/// Returns a file of a rectangle of triangles in the plane z = 0, from the origin on.
+#[cfg(test)]
+pub(crate) fn square_of_triangles(cells: [u32; 2], spacing_m: f64) -> String {
+    use std::fmt::Write;
+    let mut mesh = String::new();
+    let [nx, ny] = cells;
+    for i in 0..=nx {
+        for j in 0..=ny {
+            writeln!(mesh, "v {:?} {:?} 0", f64::from(i) * spacing_m, f64::from(j) * spacing_m).unwrap();
+        }
+    }
+    let vertex = |i: u32, j: u32| i * (ny + 1) + j + 1;
+    for i in 0..nx {
+        for j in 0..ny {
+            let corners = [vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)];
+            for [a, b, c] in [[0, 1, 2], [0, 2, 3]] {
+                writeln!(mesh, "f {} {} {}", corners[a], corners[b], corners[c]).unwrap();
+            }
+        }
+    }
+    mesh
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

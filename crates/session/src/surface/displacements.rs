@@ -71,6 +71,11 @@ impl Snapshot {
         Snapshot { topology_version: cuts.version(), cuts, ..self }
     }
 
+    /// Returns what was severed at its moment.
+    pub fn cuts(&self) -> &Cuts {
+        &self.cuts
+    }
+
     /// Returns the displacements of the shown vertices, m.
     pub(super) fn displacement_m(&self) -> &[Vec<f32>; 3] {
         match &self.skin {

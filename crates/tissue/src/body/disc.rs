@@ -1,7 +1,6 @@
 //! The interface of a disc on a kind of tissue: the area over which a tool's tip touches it.
 
 use std::fmt;
-use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -101,7 +100,7 @@ pub(crate) trait TissueDisc: fmt::Debug + Send + Sync {
 
     /// Returns samples of the surface around the place, at most `spacing_m` apart, as far as `reach_m` away, in a fixed
     /// order, m. Empty where rigid tips can't touch ([`RestShape::takes_rigid_tips`](crate::shape::RestShape)).
-    fn samples(&self, _reach_m: f64, _spacing_m: f64) -> Vec<SurfaceSample> {
+    fn samples(&self, _reach_m: f64, _spacing_m: f64, _copies: Option<&CornerCopies>) -> Vec<SurfaceSample> {
         Vec::new()
     }
 
@@ -111,10 +110,7 @@ pub(crate) trait TissueDisc: fmt::Debug + Send + Sync {
         None
     }
 
-    /// Lets the disc move with these copies of a solid's corners.
-    fn follow_copies(&mut self, _copies: Option<&Arc<CornerCopies>>) {}
-
-    /// Calls `add` with each covered point, its weight w and ∂w/∂c, the derivative by the place, 1/m; each point once. The
-    /// weights add up to 1.
-    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2));
+    /// Calls `add` with each covered point, its weight w and ∂w/∂c, the derivative by the place, 1/m; each point, or copy of it, once. The
+    /// weights add up to 1. `copies` are those of a solid with cuts.
+    fn cover(&mut self, copies: Option<&CornerCopies>, add: &mut dyn FnMut(DiscPoint, f64, DVec2));
 }

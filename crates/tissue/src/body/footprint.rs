@@ -114,7 +114,6 @@ impl Footprint {
     /// Lets the disc move with these copies of a solid's corners; with `None` it keeps the points that it covers until it moves.
     pub(crate) fn follow_cuts(&mut self, model: &Model, copies: Option<&Arc<CornerCopies>>) {
         self.copies = copies.cloned();
-        self.disc.follow_copies(copies);
         if copies.is_some() {
             self.lay(model);
         }
@@ -123,7 +122,6 @@ impl Footprint {
     /// Returns the disc on the tissue without cuts.
     pub(crate) fn without_cuts(mut self, model: &Model) -> Self {
         if self.copies.take().is_some() {
-            self.disc.follow_copies(None);
             self.lay(model);
         }
         self
@@ -161,7 +159,7 @@ impl Footprint {
 
     /// Returns samples of the surface around the place ([`TissueDisc::samples`]).
     pub(crate) fn samples(&self, reach_m: f64, spacing_m: f64) -> Vec<SurfaceSample> {
-        self.disc.samples(reach_m, spacing_m)
+        self.disc.samples(reach_m, spacing_m, self.copies.as_deref())
     }
 
     /// Returns the radius of the disc, m.
@@ -231,10 +229,11 @@ impl Footprint {
         let is_flat = disc.is_flat();
         reached.clear();
         (*rest_m, *along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
-        disc.cover(&mut |DiscPoint { point, copy }, weight, gradient| {
+        let copies = copies.as_deref();
+        disc.cover(copies, &mut |DiscPoint { point, copy }, weight, gradient| {
             let free = is_free(model, model.place_of(point));
             let index = copy.unwrap_or_else(|| model.place_of(point));
-            let mass = mass_at(model, copies.as_deref(), index);
+            let mass = mass_at(model, copies, index);
             reached.push(WeightedNode { point: model.point_of(index), free, mass, weight, gradient });
             if !is_flat {
                 let at_m = model.shape().rest_m(point);

@@ -146,8 +146,7 @@ impl Cuts {
     /// Returns where the corners of a cell of a solid are in [`Tissue::shown_displacements_m`](crate::Tissue::shown_displacements_m), x before
     /// y before z, if a cut has doubled any of them. `least` is the place of its least corner there.
     pub fn doubled_corners(&self, least: u32) -> Option<[u32; 8]> {
-        let copies = self.copies.as_ref()?;
-        copies.number_of(least as usize).map(|number| copies.cubes()[number].corners)
+        self.copies.as_ref()?.cut_corners(least as usize)
     }
 
     /// Returns the version of the topology since which two cells of a solid no longer share a corner that they have in common; `None` if

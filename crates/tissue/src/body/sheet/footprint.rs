@@ -19,6 +19,7 @@ use std::sync::OnceLock;
 use glam::{DVec2, DVec3};
 
 use crate::body::disc::{DiscPoint, TissueDisc};
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::Sheet;
 use palpate_refusal::Result;
@@ -182,7 +183,7 @@ impl TissueDisc for GridDisc {
         true
     }
 
-    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
+    fn cover(&mut self, _copies: Option<&CornerCopies>, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
         self.covered().for_each(|(point, weight, gradient)| add(self.sheet.point(point).into(), weight, gradient));
     }
 }

@@ -157,6 +157,12 @@ impl CornerCopies {
         self.cube_at.get(cube).filter(|at| **at != NONE).map(|at| *at as usize)
     }
 
+    /// Returns the places of the corners of a cube, x before y before z, if it has copies among them.
+    #[inline]
+    pub(crate) fn cut_corners(&self, cube: usize) -> Option<[u32; 8]> {
+        self.number_of(cube).map(|number| self.cubes[number].corners)
+    }
+
     /// Returns the cubes around a place that have copies among their corners, by their places in the list, ascending.
     pub(crate) fn cut_cubes_around(&self, places: &SolidPlaces, place: usize) -> Vec<usize> {
         let around = cubes_around(places, self.corner_of(place));
@@ -265,8 +271,8 @@ impl CornerCopies {
 /// Returns the places of the corners of a cube, x before y before z, in a solid with these copies.
 #[inline]
 pub(crate) fn corners_of(places: &SolidPlaces, copies: Option<&CornerCopies>, cube: usize) -> [usize; 8] {
-    match copies.and_then(|copies| copies.number_of(cube).map(|number| &copies.cubes[number])) {
-        Some(cut) => cut.corners.map(|place| place as usize),
+    match copies.and_then(|copies| copies.cut_corners(cube)) {
+        Some(corners) => corners.map(|place| place as usize),
         None => places.corners_of(cube),
     }
 }

@@ -21,9 +21,7 @@ const MAX_SIDE_PARTS: f64 = 16.0;
 
 /// Returns the places of the corners of a cell, if a cut has doubled any of them.
 fn copies_in(shape: &SolidShape, copies: Option<&CornerCopies>, cell: &CellPlace) -> Option<[u32; 8]> {
-    let copies = copies?;
-    let number = copies.number_of(shape.corner_of(PointId::new(cell.points[0] as usize)))?;
-    Some(copies.cubes()[number].corners)
+    copies?.cut_corners(shape.corner_of(PointId::new(cell.points[0] as usize)))
 }
 
 /// The part of a vertex's weight and derivative that a point gets.
@@ -45,20 +43,13 @@ pub(crate) struct SolidDisc {
     disc: MeshDisc,
     /// What each vertex gives to its points; kept, so that a step allocates nothing.
     covered: Vec<CoveredPart>,
-    /// The corners that cuts have doubled.
-    copies: Option<Arc<CornerCopies>>,
 }
 
 impl SolidDisc {
     /// Creates a disc at an arbitrary place.
     pub(crate) fn new(shape: &Arc<SolidShape>, radius_m: f64) -> Self {
         let disc = MeshDisc::whole(shape.surface(), radius_m);
-        SolidDisc { shape: shape.clone(), disc, covered: Vec::new(), copies: None }
-    }
-
-    /// Returns the places of the corners of a cell, if a cut has doubled any of them.
-    fn copies_in(&self, cell: &CellPlace) -> Option<[u32; 8]> {
-        copies_in(&self.shape, self.copies.as_deref(), cell)
+        SolidDisc { shape: shape.clone(), disc, covered: Vec::new() }
     }
 }
 
@@ -120,7 +111,7 @@ impl TissueDisc for SolidDisc {
     }
 
     /// Divides each triangle into equal ones of the same shape, and takes their middles.
-    fn samples(&self, reach_m: f64, spacing_m: f64) -> Vec<SurfaceSample> {
+    fn samples(&self, reach_m: f64, spacing_m: f64, copies: Option<&CornerCopies>) -> Vec<SurfaceSample> {
         let mut samples = Vec::new();
         for [a, b, c] in self.disc.triangles_around(reach_m) {
             let longest_m = (b - a).length().max((c - b).length()).max((a - c).length());
@@ -132,7 +123,13 @@ impl TissueDisc for SolidDisc {
                 let rest_m = a + by_along * along + by_across * across;
                 let outward = cross.normalize_or_zero();
                 let cell = self.shape.bind(rest_m);
-                samples.push(SurfaceSample { rest_m, outward, area_m2, copies: self.copies_in(&cell), cell });
+                samples.push(SurfaceSample {
+                    rest_m,
+                    outward,
+                    area_m2,
+                    copies: copies_in(&self.shape, copies, &cell),
+                    cell,
+                });
             };
             let parts = parts as u32;
             for i in 0..parts {
@@ -148,16 +145,12 @@ impl TissueDisc for SolidDisc {
         samples
     }
 
-    fn follow_copies(&mut self, copies: Option<&Arc<CornerCopies>>) {
-        self.copies = copies.cloned();
-    }
-
-    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
-        let SolidDisc { shape, disc, covered, copies } = self;
+    fn cover(&mut self, copies: Option<&CornerCopies>, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
+        let SolidDisc { shape, disc, covered } = self;
         covered.clear();
-        disc.cover(&mut |vertex, weight, gradient| {
+        disc.cover(None, &mut |vertex, weight, gradient| {
             let cell = shape.cell_of(vertex.point.index());
-            let of_cell = copies_in(shape, copies.as_deref(), cell);
+            let of_cell = copies_in(shape, copies, cell);
             for (corner, (point, part)) in cell.points.iter().zip(&cell.weights).enumerate() {
                 if *part > 0.0 {
                     let order = u32::try_from(covered.len()).unwrap_or(u32::MAX);

@@ -7,6 +7,7 @@ use glam::{DMat3, DVec2, DVec3};
 use palpate_geometry::surface::{Covered, Place, SurfaceDisc};
 
 use crate::body::disc::{DiscPoint, TissueDisc};
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::saved::{SavedPlace, ensure, unsound};
 use crate::scene::MeshShape;
 use crate::shape::PointId;
@@ -158,7 +159,7 @@ impl TissueDisc for MeshDisc {
         Some(self.disc.weight_of(vertex.index() as u32))
     }
 
-    fn cover(&mut self, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
+    fn cover(&mut self, _copies: Option<&CornerCopies>, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
         self.disc.lay(self.shape.surface(), &self.place);
         let covered = self.disc.covered().iter();
         let point = |vertex: u32| PointId::new(vertex as usize).into();

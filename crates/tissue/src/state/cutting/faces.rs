@@ -11,7 +11,7 @@ use glam::DVec3;
 use super::{Crossing, EdgeSweep};
 use crate::body::severed::SeveredSpring;
 use crate::body::solid::SolidPlaces;
-use crate::body::solid::corner_copies::corners_of;
+use crate::body::solid::corner_copies::{CutCube, corners_of};
 use crate::body::spring_ends::SpringEnd;
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
@@ -28,6 +28,7 @@ const AXES: usize = 3;
 
 impl<T: Real> TissueState<T> {
     /// Returns the faces that a blade crosses, from the lower one of their cubes; some perhaps twice.
+    #[allow(clippy::cast_precision_loss)]
     pub(super) fn crossed_faces(&self, sweep: &EdgeSweep) -> Vec<Crossing> {
         let TissueState { model, tables, state, tiles, spring_search, .. } = self;
         let (Some(search), Some(places)) = (spring_search, model.places.solid()) else { return Vec::new() };
@@ -37,10 +38,7 @@ impl<T: Real> TissueState<T> {
             let reach_m = edges * model.unit_m;
             place_m.cmpge(least_m - reach_m).all() && place_m.cmple(most_m + reach_m).all()
         };
-        // By the displacement of the least corner alone.
-        let is_roughly_near = |cube: usize, corner: usize| {
-            is_near(model.end_at_rest_m(cube) + model.unit_m * self.vector(&state.u, corner), REACH + SLACK)
-        };
+        // By the displacement of the least corner alone: a cube's middle follows.
         for tile in 0..tiles.tile_count() {
             let [low_m, high_m] = search.tile_box_m(model, layout, state, &tiles.moved, tile);
             let reach_m = (REACH + SLACK) * model.unit_m;
@@ -49,9 +47,13 @@ impl<T: Real> TissueState<T> {
             }
             let [rows, columns] = sides_of(layout, tile);
             for row in rows {
+                // Without the divisions that find one cube's place.
+                let (first_m, from) = (model.end_at_rest_m(row * layout.columns), row * layout.stride);
                 for column in columns.clone() {
                     let cube = row * layout.columns + column;
-                    if places.weight(cube) > 0.0 && is_roughly_near(cube, cube) {
+                    let middle_m =
+                        first_m + model.unit_m * (column as f64 * DVec3::X + self.vector_at(&state.u, from + column));
+                    if is_near(middle_m, REACH + SLACK) && places.weight(cube) > 0.0 {
                         self.crossed_faces_of(places, cube, sweep, &is_near, &mut found);
                     }
                 }
@@ -59,8 +61,11 @@ impl<T: Real> TissueState<T> {
         }
         // Beside a cut, a cube may be anywhere.
         let cut = tables.severed.copies().map_or(&[][..], |copies| copies.cubes());
-        for cube in cut.iter().filter(|cube| is_roughly_near(cube.cube as usize, cube.corners[0] as usize)) {
-            self.crossed_faces_of(places, cube.cube as usize, sweep, &is_near, &mut found);
+        for CutCube { cube, corners } in cut {
+            let u = self.vector(&state.u, corners[0] as usize);
+            if is_near(model.end_at_rest_m(*cube as usize) + model.unit_m * u, REACH + SLACK) {
+                self.crossed_faces_of(places, *cube as usize, sweep, &is_near, &mut found);
+            }
         }
         found
     }
@@ -129,9 +134,13 @@ impl<T: Real> TissueState<T> {
     /// Returns the value of a field at a place.
     #[inline]
     fn vector(&self, field: &[T], place: usize) -> DVec3 {
-        let layout = &self.tables.layout;
-        let at = layout.offset(place);
-        let component = |c: usize| field[c * layout.plane + at].wide();
+        self.vector_at(field, self.tables.layout.offset(place))
+    }
+
+    /// Returns the value of a field at an offset within a plane.
+    #[inline]
+    fn vector_at(&self, field: &[T], at: usize) -> DVec3 {
+        let component = |c: usize| field[c * self.tables.layout.plane + at].wide();
         DVec3::new(component(0), component(1), component(2))
     }
 

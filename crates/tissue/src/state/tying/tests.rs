@@ -1,11 +1,11 @@
 //! Tests of threads and clips: what they hold, how long they stay, and that they give no energy.
 #![allow(clippy::unwrap_used)]
 
-use std::fmt::Write;
 use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::compile::square_of_triangles;
 use crate::interface::Tissue;
 use crate::limits::Limits;
 use crate::scene::Scene;
@@ -15,27 +15,6 @@ use crate::{Model, Push, at_rest, restored};
 use palpate_haptics::{Tip, TipShape};
 
 const STEPPING: &str = "[stepping]\nintegrator = \"exponential2\"\nprecision = \"f64\"\ntolerance = 1e-3\n";
-
-/// Returns a file of a square of triangles in the plane z = 0.
-fn square(cells: [u32; 2], spacing_m: f64) -> String {
-    let mut mesh = String::new();
-    let [nx, ny] = cells;
-    for i in 0..=nx {
-        for j in 0..=ny {
-            writeln!(mesh, "v {:?} {:?} 0", f64::from(i) * spacing_m, f64::from(j) * spacing_m).unwrap();
-        }
-    }
-    let vertex = |i: u32, j: u32| i * (ny + 1) + j + 1;
-    for i in 0..nx {
-        for j in 0..ny {
-            let corners = [vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)];
-            for [a, b, c] in [[0, 1, 2], [0, 2, 3]] {
-                writeln!(mesh, "f {} {} {}", corners[a], corners[b], corners[c]).unwrap();
-            }
-        }
-    }
-    mesh
-}
 
 /// Returns a strip of 12 × 8 cells of 5 mm whose end at x = 0 is fixed: a sheet or a surface.
 fn strip(kind: &str, anchor: f64) -> Arc<Model> {
@@ -58,7 +37,7 @@ fn strip(kind: &str, anchor: f64) -> Arc<Model> {
          [springs]\nstiffness_n_per_m = 100\n{both}",
         fixed.join(", ")
     );
-    let mesh = square([12, 8], 0.005);
+    let mesh = square_of_triangles([12, 8], 0.005);
     let scene = Scene::parse_given("strip", &text, ("strip.obj", mesh.as_bytes()), &Limits::default()).unwrap();
     Model::compile(&scene, &Limits::default()).unwrap()
 }

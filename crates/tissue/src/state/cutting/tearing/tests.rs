@@ -1,11 +1,11 @@
 //! Tests of tears: at which strain they begin, and which springs go.
 #![allow(clippy::unwrap_used)]
 
-use std::fmt::Write;
 use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::compile::square_of_triangles;
 use crate::interface::Tissue;
 use crate::limits::Limits;
 use crate::scene::Scene;
@@ -37,21 +37,7 @@ fn square(kind: &str, cells: u32, bends: bool, more: &str) -> Arc<Model> {
         );
         return Model::parse("square", &text, &[]).unwrap();
     }
-    let mut mesh = String::new();
-    for i in 0..=cells {
-        for j in 0..=cells {
-            writeln!(mesh, "v {:?} {:?} 0", f64::from(i) * spacing_m, f64::from(j) * spacing_m).unwrap();
-        }
-    }
-    let vertex = |i: u32, j: u32| i * (cells + 1) + j + 1;
-    for i in 0..cells {
-        for j in 0..cells {
-            let corners = [vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)];
-            for [a, b, c] in [[0, 1, 2], [0, 2, 3]] {
-                writeln!(mesh, "f {} {} {}", corners[a], corners[b], corners[c]).unwrap();
-            }
-        }
-    }
+    let mesh = square_of_triangles([cells; 2], spacing_m);
     let text = format!(
         "[mesh]\nfile = \"square.obj\"\nunit = \"m\"\npoint_mass_kg = {mass_kg:?}\n\
          [springs]\nstiffness_n_per_m = 100\nbending = {}\n{both}",
