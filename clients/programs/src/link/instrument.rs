@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use palpate_haptics::envelope::Envelope;
 use palpate_haptics::hand::{Hand, HandState};
 use palpate_haptics::{
-    Instrument, InstrumentPose, InstrumentRenderer, InstrumentVelocity, Prediction, Tip, Wrench, WrenchSample,
+    Instrument, InstrumentPose, InstrumentRenderer, InstrumentVelocity, Prediction, Tip, TipShape, Wrench, WrenchSample,
 };
 use palpate_session::led_instrument::InstrumentSample;
 use palpate_session::tissue_copy::TissueCopy;
@@ -30,7 +30,12 @@ pub(super) enum InstrumentKind {
     Shaft,
     /// A shaft of 10 mm and two jaws of 15 mm that point into the tissue, and open and close
     Grasper,
+    /// A blade with an edge of 12 mm that points into the tissue, and cuts it
+    Scalpel,
 }
+
+/// Length of a scalpel's edge, m.
+const EDGE_M: f64 = 0.012;
 
 /// Radius at which a turning hand has its mass, damper and spring, m.
 const GYRATION_M: f64 = 0.03;
@@ -58,6 +63,10 @@ impl InstrumentKind {
         let (jaws_m, shaft_m) = match self {
             InstrumentKind::Shaft => (None, 0.025),
             InstrumentKind::Grasper => (Some(0.015), 0.01),
+            InstrumentKind::Scalpel => {
+                let blade = Tip { shape: TipShape::Blade, edge_m: -EDGE_M * DVec3::X, ..Tip::default() };
+                return Instrument::of_tip(blade);
+            }
         };
         instrument.add_parts(jaws_m.map(|length_m| (length_m, tip)), Some((shaft_m, tip)));
         instrument
@@ -67,7 +76,7 @@ impl InstrumentKind {
     fn orientation(self) -> DQuat {
         DQuat::from_rotation_y(match self {
             InstrumentKind::Shaft => 0.3,
-            InstrumentKind::Grasper => 1.2,
+            InstrumentKind::Grasper | InstrumentKind::Scalpel => 1.2,
         })
     }
 }
@@ -155,10 +164,23 @@ pub(super) struct InstrumentOutcome {
     /// Least energy that the port had received, J: negative if it gave more.
     pub(super) energy_min_j: f64,
     pub(super) unstable_at_s: Option<f64>,
+    /// Number of springs or faces that a blade has severed on the server, and without a network.
+    pub(super) severed: u64,
+    pub(super) true_severed: u64,
+    /// Largest change of the rendered and of the true force from one tick to the next, N.
+    pub(super) jump_max_n: f64,
+    pub(super) true_jump_max_n: f64,
     /// Ticks with an answer of the copy.
     pub(super) predicted_ticks: u64,
     /// What limited the wrench, and in how many ticks.
     pub(super) limits: Vec<(&'static str, u64)>,
+}
+
+/// The forces of the tick before, N.
+#[derive(Default)]
+struct LastForces {
+    rendered_n: DVec3,
+    true_n: DVec3,
 }
 
 /// Sums of squares of errors and of true values.
@@ -275,7 +297,7 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
     let mut hand = TurningHand::new(setup.hand, course.task.start_m());
     let (mut outcome, mut errors) =
         (InstrumentOutcome { tips: instrument.tips.len(), ..Default::default() }, WrenchErrors::default());
-    let mut paused_s = None;
+    let (mut paused_s, mut last) = (None, LastForces::default());
     for tick in 0..ticks(setup.duration_s) {
         let now_s = f64::from(tick) * TICK_S;
         let away_m = hand.moved.place_m.distance(course.task.start_m());
@@ -301,6 +323,12 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
         let rendered = renderer.tick(now_s, &pose);
         twin.lead(0, number, &pose, 0, now_s)?;
         let truth = step(&mut twin, now_s)?.map_or(Wrench::default(), |felt| felt.wrench);
+        for (jump_max_n, last_n, force_n) in [
+            (&mut outcome.jump_max_n, &mut last.rendered_n, rendered.force_n),
+            (&mut outcome.true_jump_max_n, &mut last.true_n, truth.force_n),
+        ] {
+            *jump_max_n = jump_max_n.max(force_n.distance(std::mem::replace(last_n, force_n)));
+        }
         let touches = truth.force_n != DVec3::ZERO || rendered.force_n.length() > 1e-6;
         if touches && now_s > task::LEAD_S {
             errors.add(&rendered, &truth);
@@ -313,6 +341,7 @@ pub(super) fn run(setup: &Setup, kind: InstrumentKind) -> Result<InstrumentOutco
     }
     outcome.force_error_percent = WrenchErrors::percent(errors.force);
     outcome.torque_error_percent = WrenchErrors::percent(errors.torque);
+    (outcome.severed, outcome.true_severed) = (server.severed(), twin.severed());
     outcome.predicted_ticks = renderer.predicted();
     outcome.limits = super::measure::interventions(&renderer.envelope);
     Ok(outcome)

@@ -46,6 +46,11 @@ impl LedTissue {
         self.simulation.session.step_count()
     }
 
+    /// Returns the number of springs or faces that blades have severed.
+    pub(super) fn severed(&self) -> u64 {
+        self.simulation.session.tissue().cuts().len() as u64
+    }
+
     /// Leads an instrument to a pose by the command with a number; it is played by the client's time, ns, if that is not 0.
     ///
     /// # Errors

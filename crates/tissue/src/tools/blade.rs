@@ -46,6 +46,7 @@ impl Tool {
         self.side = Some(1.0);
         let below_m = (surface_m - place_m).dot(self.normal);
         let depth_m = (below_m / edge.dot(self.normal).max(MIN_SLOPE)).min(length_m);
+        self.pierced_m = depth_m.max(0.0);
         let most_n = model.scene.cutting.resistance_n(depth_m);
         let pierced_m = place_m + depth_m * edge;
         let is_beside = self.footprint.is_beside(pierced_m - surface_m, self.normal);

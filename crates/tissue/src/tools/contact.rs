@@ -64,7 +64,7 @@ use crate::scene::tie::Tie;
 use crate::tools::burns::Burns;
 use crate::tools::rigid_tip::RigidTip;
 use crate::tools::tie::Ties;
-use palpate_haptics::{ContactState, Coupling, Tip};
+use palpate_haptics::{ContactState, Coupling, Tip, TipShape};
 use palpate_refusal::Result;
 
 /// If the determinant of a scheme's impulse and constant force is below this, the scheme has one unknown, not
@@ -144,6 +144,8 @@ pub(crate) struct Tool {
     pub(crate) to_m: DVec3,
     /// The edge of a blade at the step's beginning, m; that at its end is the tip's.
     pub(crate) from_edge_m: DVec3,
+    /// How far along its edge from the tip a blade pierces the surface, m; found anew in each substep.
+    pub(crate) pierced_m: f64,
     pub(crate) contact_state: ContactState,
     /// Normal of the surface under the disc, on the tool's side.
     pub(crate) normal: DVec3,
@@ -214,6 +216,7 @@ impl Contacts {
             from_m: to_m,
             to_m,
             from_edge_m: tip.edge_m,
+            pierced_m: 0.0,
             contact_state: ContactState::Free,
             normal: DVec3::Z,
             side: None,
@@ -395,6 +398,7 @@ impl Tool {
             from_m: checks.vector(saved.from_m)?,
             to_m: checks.vector(saved.to_m)?,
             from_edge_m: checks.vector(saved.from_edge_m)?,
+            pierced_m: 0.0,
             contact_state: contact_state.unwrap_or(ContactState::Free),
             normal: checks.vector(saved.normal)?,
             side,
@@ -566,9 +570,15 @@ impl Tool {
         if lags && self.tip.coupling == Coupling::Constraint && !self.tip.grasps { across_m } else { DVec3::ZERO }
     }
 
-    /// Returns the movement of the tool in a substep, m.
+    /// Returns the movement of the tool in a substep, m: of a blade, that of the place of its edge which pierces the surface. This one also
+    /// moves as the edge turns, and there the blade works.
     pub(crate) fn own_movement_m(&self, model: &Model, plan: &Plan) -> DVec3 {
-        (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s)
+        let mut moved_m = self.to_m - self.from_m;
+        if self.tip.shape == TipShape::Blade {
+            let turned = self.tip.edge_m.normalize_or_zero() - self.from_edge_m.normalize_or_zero();
+            moved_m += self.pierced_m * turned;
+        }
+        moved_m * (model.scene.stepping.rate_hz * plan.substep_s)
     }
 
     /// Returns the tool's path in the substep that ends at `fraction` of the step.

@@ -258,6 +258,39 @@ fn a_blade_pushes_first_and_then_cuts_with_the_work_of_separation() {
 }
 
 #[test]
+fn a_blade_that_turns_as_it_cuts_does_not_look_like_energy_from_nowhere() {
+    let model = Model::paper(&[
+        "sheet.points=[31, 31]",
+        "sheet.spacing_m=0.0025",
+        "sheet.point_mass_kg=6.625e-5",
+        "springs.stiffness_n_per_m=40.5",
+        "springs.shear_stiffness_n_per_m=20.25",
+        "anchor_springs.stiffness_n_per_m=5.655",
+        "damping.coefficient_n_s_per_m=0.01936",
+        "cutting.toughness_j_per_m2=20",
+    ]);
+    for seed in 0..4 {
+        let mut tissue = at_rest(&model);
+        let phase = f64::from(seed);
+        // As a hand leads it: in and out and along, while the edge turns about two axes.
+        for step in 0..2500 {
+            let time_s = 1e-3 * f64::from(step);
+            let swing = |hz: f64, phase: f64| (std::f64::consts::TAU * hz * time_s + phase).sin();
+            let place_m = DVec3::new(
+                0.0375 + 0.008 * swing(0.4, 2.0 * phase),
+                0.0375 + 0.01 * swing(0.5, phase),
+                -0.001 - 0.004 * swing(0.7, 3.0 * phase),
+            );
+            let edge_m = 0.012 * DVec3::new(0.4 * swing(1.0, phase), 0.4 * swing(0.7, 1.0 + phase), 1.0).normalize();
+            tissue.pose(0, place_m, Tip { edge_m, ..blade() });
+            tissue.step().unwrap();
+        }
+        assert_eq!(tissue.guard_events(), 0, "seed {seed}");
+        assert!(tissue.cuts().len() > 10, "seed {seed}: {} severed", tissue.cuts().len());
+    }
+}
+
+#[test]
 fn scissors_cut_what_lies_between_their_edges_when_they_close() {
     let model = sheet(&["stepping.precision=f64"]);
     let text = "duration_s = 0.3\nsample_every_s = 0.1\n[[instrument]]\nscissors = { length_m = 0.03 }\n\
