@@ -244,7 +244,11 @@ impl Pacer {
         let mut intake = Intake::new(&first.scene, &self.limits)
             .of_substeps(first.plan.substeps)
             .charged_to(owner)
+            .of_cut_bytes(first.cut_bytes())
             .continued(&session, changed_to);
+        if first.scene.cutting.tear_strain.is_some() || !session.tissue().cuts().is_empty() {
+            intake.charge_cuts(points_key)?;
+        }
         if let Some(reason) = session.hold_reason() {
             drop(intake.close(Refusal::new(Reason::SessionHeld, "", reason)));
         }

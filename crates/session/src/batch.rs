@@ -6,7 +6,7 @@ use smallvec::SmallVec;
 use super::command::Command;
 use super::intake::Intake;
 use super::lease::LeaseId;
-use super::rules::{CheckedCommands, LeasedTip, check_contact_work, check_tip, leased_tip};
+use super::rules::{CheckedCommands, LeasedTip, check_contact_work, check_tip, leased_tip, may_sever};
 use palpate_refusal::{Reason, Refusal, Result};
 
 /// Largest number of commands that one call of [`Intake::go_on`] puts in the queue.
@@ -64,7 +64,8 @@ impl Intake {
     /// - [`Reason::StaleSequence`]: a sequence number does not rise, and the command did not come by datagram.
     /// - [`Reason::TooLarge`]: the session's tips together exceed `limits.contact_work`.
     /// - [`Reason::QueueFull`]: more commands of a tool would wait than `limits.queued_commands_per_tool`.
-    /// - [`Reason::Overloaded`] or [`Reason::TooLarge`]: the account has no memory for the commands.
+    /// - [`Reason::Overloaded`] or [`Reason::TooLarge`]: the account has no memory for the commands, or for what a tip
+    ///   severs (field `pose.tip`).
     pub fn accept(
         &mut self,
         id: LeaseId,
@@ -114,6 +115,9 @@ impl Intake {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");
                 return Err(Refusal::new(Reason::QueueFull, "", message));
             }
+        }
+        if commands.iter().any(|command| may_sever(&command.action)) {
+            self.charge_cuts("pose.tip")?;
         }
         self.make_room(commands.len())?;
         self.counts.accepted += commands.len() as u64;

@@ -73,6 +73,9 @@ pub struct Intake {
     /// Account that is charged for what waits, and the memory that was taken for commands.
     pub(super) account: Option<Account>,
     taken: Option<Taken>,
+    /// The memory that severed springs may take, bytes (`Model::cut_bytes`), and once it was taken.
+    cut_bytes: u64,
+    cut_memory: Option<Taken>,
     /// The tissue after the last accepted change, if there was one.
     pub(super) changed_to: Option<Arc<Model>>,
     pub(super) arrivals: u64,
@@ -105,6 +108,8 @@ impl Intake {
             changes: VecDeque::new(),
             account: None,
             taken: None,
+            cut_bytes: 0,
+            cut_memory: None,
             changed_to: None,
             arrivals: 0,
             next_step: 0,
@@ -138,6 +143,24 @@ impl Intake {
     #[must_use]
     pub fn charged_to(self, account: &Account) -> Self {
         Intake { account: Some(account.clone()), ..self }
+    }
+
+    /// Returns this intake for a tissue whose severed springs may take `cut_bytes` bytes
+    /// ([`Model::cut_bytes`]). The account is charged for them with the first command by which a tool may sever
+    /// springs, not before: most sessions are never cut.
+    #[must_use]
+    pub fn of_cut_bytes(self, cut_bytes: u64) -> Self {
+        Intake { cut_bytes, ..self }
+    }
+
+    /// Charges the account for the memory of severed springs, if that was not done yet.
+    ///
+    /// # Errors
+    /// [`Reason::Overloaded`] or [`Reason::TooLarge`]: the account has no memory for them.
+    pub fn charge_cuts(&mut self, field: &str) -> Result<()> {
+        let Some(account) = self.account.as_ref().filter(|_| self.cut_memory.is_none()) else { return Ok(()) };
+        self.cut_memory = Some(account.take(Resource::Memory(Purpose::Session), self.cut_bytes, field)?);
+        Ok(())
     }
 
     /// Returns this intake for a continued session, at that session's step. Its tissue is `changed_to`; `None` if it

@@ -5,7 +5,7 @@ use super::input::Input;
 use super::intake::Intake;
 use super::lease::HandedLease;
 use super::queue::Discarded;
-use super::rules::leased_tip;
+use super::rules::{leased_tip, may_sever};
 use crate::budget::{Purpose, Resource};
 use palpate_refusal::Refusal;
 
@@ -49,7 +49,9 @@ impl Intake {
             self.take_tip(tool);
         }
         let commands = handed.waiting.iter().filter(|(_, input)| matches!(input, Input::Command(_))).count();
-        let has_room = self.make_room(commands).is_ok();
+        let severs = |input: &Input| matches!(input, Input::Command(due) if may_sever(&due.command.action));
+        let has_room = self.make_room(commands).is_ok()
+            && (!handed.waiting.iter().any(|(_, input)| severs(input)) || self.charge_cuts("").is_ok());
         let mut dropped = 0;
         for (step, input) in handed.waiting {
             let step = step.max(self.next_step);

@@ -149,6 +149,11 @@ pub(super) fn check_contact_work(
     Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
 }
 
+/// Returns whether a tool may sever springs by an action: with a blade or by heat.
+pub(super) fn may_sever(action: &Action) -> bool {
+    matches!(action, Action::Pose { tip, .. } if tip.shape == TipShape::Blade || tip.burn_s > 0.0)
+}
+
 /// What of a tip stays while a tool is led.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LeasedTip {

@@ -3,7 +3,8 @@
 
 use super::super::batch::SLICE;
 use super::*;
-use palpate_haptics::Tip;
+use crate::budget::Budget;
+use palpate_haptics::{Tip, TipShape};
 use palpate_tissue::scene::PAPER;
 use palpate_tissue::shape::PointId;
 
@@ -310,6 +311,31 @@ fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_o
     intake.release(LEASE).unwrap();
     due(&mut intake, 13);
     assert_eq!(charged(), 0);
+}
+
+#[test]
+fn the_memory_of_cuts_is_charged_with_the_first_command_that_may_cut() {
+    let account = Account::alone();
+    let mut intake = intake().0.charged_to(&account).of_cut_bytes(5000);
+    let has = || account.has(Resource::Memory(Purpose::Session));
+    let pose = |sequence: u64, tip: Tip| Command {
+        action: Action::Pose { place_m: glam::DVec3::ZERO, velocity_m_per_s: None, tip },
+        ..release(sequence, None)
+    };
+    intake.submit(LEASE, vec![pose(1, Tip::default()), release(2, None)], 0).unwrap();
+    assert_eq!(has(), 0);
+    let blade = Tip { shape: TipShape::Blade, edge_m: 0.01 * glam::DVec3::Z, ..Tip::default() };
+    for sequence in [3, 5] {
+        intake.submit(LEASE, vec![pose(sequence, blade), release(sequence + 1, None)], 0).unwrap();
+        assert_eq!(has(), 5000);
+    }
+    // Without memory for it, no part of the batch is accepted.
+    let poor = Budget::new(&Limits { memory_bytes: 4 * PIECE_BYTES, ..Limits::default() }, 1, 1).account("poor");
+    let mut intake = self::intake().0.charged_to(&poor).of_cut_bytes(8 * PIECE_BYTES);
+    let burning = Tip { burn_s: 0.1, ..Tip::default() };
+    let refusal = intake.submit(LEASE, vec![release(1, None), pose(2, burning)], 0).unwrap_err();
+    assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "pose.tip"), "{refusal}");
+    assert_eq!(intake.counts().accepted, 0);
 }
 
 #[test]
