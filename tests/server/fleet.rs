@@ -2,6 +2,7 @@
 //! etcd, or hands it over.
 #![cfg(target_os = "linux")]
 
+mod cut;
 mod unsure;
 
 use std::collections::BTreeMap;

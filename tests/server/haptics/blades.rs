@@ -8,10 +8,10 @@ use palpate_proto::pb::command::Action;
 use palpate_proto::{instrument, pb};
 use palpate_tissue::select::scheme_selection::NEVER;
 
-const STEPS: u64 = 400;
+pub(crate) const STEPS: u64 = 400;
 
 /// A blade with an edge of 20 mm.
-fn knife() -> Instrument {
+pub(crate) fn knife() -> Instrument {
     let edge_m = -0.02 * DVec3::X;
     Instrument::of_tip(Tip { shape: TipShape::Blade, radius_m: 0.001, edge_m, ..Tip::default() })
 }
@@ -27,12 +27,12 @@ fn pose_at(step: u64) -> InstrumentPose {
     instrument::from_pose(&instrument::pose(&pose), &knife()).unwrap().0
 }
 
-async fn create(server: &TestServer, source: pb::create_session_request::Source) -> String {
+pub(crate) async fn create(server: &TestServer, source: pb::create_session_request::Source) -> String {
     let request = pb::CreateSessionRequest { source: Some(source), paused: true, ..Default::default() };
     server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id
 }
 
-async fn topology(server: &TestServer, session_id: &str, since_version: u32) -> pb::GetTopologyResponse {
+pub(crate) async fn topology(server: &TestServer, session_id: &str, since_version: u32) -> pb::GetTopologyResponse {
     let request = pb::GetTopologyRequest { session_id: session_id.to_owned(), since_version };
     let mut parts = server.views().await.get_topology(request).await.unwrap().into_inner();
     let mut whole = pb::GetTopologyResponse::default();
@@ -61,7 +61,7 @@ async fn wound(server: &TestServer, session_id: &str, refinement: u32, since_ver
 }
 
 /// Sends the commands of some steps and lets them pass.
-async fn lead(server: &TestServer, session: &str, touch: &mut TestTouch, steps: std::ops::Range<u64>) {
+pub(crate) async fn lead(server: &TestServer, session: &str, touch: &mut TestTouch, steps: std::ops::Range<u64>) {
     for step in steps.clone() {
         let action = Some(Action::Instrument(instrument::pose(&pose_at(step))));
         let sequence = Some(step + 1);

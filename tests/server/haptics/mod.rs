@@ -1,6 +1,6 @@
 //! Touch: contact, force laws, and the streams of devices.
 
-mod blades;
+pub(crate) mod blades;
 mod commands;
 mod contact;
 mod instruments;
