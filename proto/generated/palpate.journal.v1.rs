@@ -99,7 +99,7 @@ pub struct Command {
     /// Not a client's command: it ends a lease and what its holder did with the tool.
     #[prost(bool, tag = "9")]
     pub ends_lease: bool,
-    #[prost(oneof = "command::Action", tags = "10, 11, 12, 13, 14")]
+    #[prost(oneof = "command::Action", tags = "10, 11, 12, 13, 14, 15")]
     pub action: ::core::option::Option<command::Action>,
 }
 /// Nested message and enum types in `Command`.
@@ -116,6 +116,8 @@ pub mod command {
         Release(super::Release),
         #[prost(message, tag = "14")]
         Tie(super::Tie),
+        #[prost(message, tag = "15")]
+        Mark(super::Mark),
     }
 }
 impl ::prost::Name for Command {
@@ -126,6 +128,26 @@ impl ::prost::Name for Command {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.Command".into()
+    }
+}
+/// A place that a person marked on the surface, as an answer in an exercise.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Mark {
+    /// In the tissue's frame.
+    #[prost(message, optional, tag = "1")]
+    pub place_m: ::core::option::Option<crate::pb::Vector3>,
+    /// The diameter of what they think is there. Absent: they don't say.
+    #[prost(double, optional, tag = "2")]
+    pub diameter_m: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Mark {
+    const NAME: &'static str = "Mark";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.Mark".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.Mark".into()
     }
 }
 /// A thread or clip, from its command's step on.

@@ -187,7 +187,7 @@ pub struct Command {
     #[prost(double, optional, tag = "5")]
     pub time_to_live_s: ::core::option::Option<f64>,
     /// The action.
-    #[prost(oneof = "command::Action", tags = "6, 7, 8, 9, 10, 11")]
+    #[prost(oneof = "command::Action", tags = "6, 7, 8, 9, 10, 11, 12")]
     pub action: ::core::option::Option<command::Action>,
 }
 /// Nested message and enum types in `Command`.
@@ -211,6 +211,9 @@ pub mod command {
         /// released. Not on an instrument.
         #[prost(message, tag = "11")]
         Tie(super::Tie),
+        /// Marks a place of the surface. It changes nothing, and what the tool does goes on. Not on an instrument.
+        #[prost(message, tag = "12")]
+        Mark(super::Mark),
     }
 }
 impl ::prost::Name for Command {
@@ -221,6 +224,26 @@ impl ::prost::Name for Command {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Command".into()
+    }
+}
+/// A place that a person marks on the surface, as an answer in an exercise: what they look for is there, or below it.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Mark {
+    /// In the tissue's frame, at most a tenth of the tissue's longest side away from it.
+    #[prost(message, optional, tag = "1")]
+    pub place_m: ::core::option::Option<Vector3>,
+    /// The diameter that they think it has, m: above 0, and at most the tissue's longest side. Absent: they don't say.
+    #[prost(double, optional, tag = "2")]
+    pub diameter_m: ::core::option::Option<f64>,
+}
+impl ::prost::Name for Mark {
+    const NAME: &'static str = "Mark";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Mark".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Mark".into()
     }
 }
 /// A thread or clip from its command's step on. With the bites that it has already, only length, friction and strength change; with

@@ -259,6 +259,9 @@ class Session:
     ) -> None:
         """Closes clip `number` on two places of the tissue at rest, and holds them together; it opens beyond a force of `strength_n`.
         Threads and clips share their numbers. It stays when the tool, which does what it did, is released."""
+    def mark(self, tool: int, place_m: Vector, *, diameter_m: Optional[float] = None) -> None:
+        """Marks a place of the surface, m, as an answer in an exercise: what you look for is there, or below it, and has about this
+        diameter, m. It changes nothing, and the tool does what it did."""
     def untie(self, tool: int, number: int) -> None:
         """Cuts a thread or clip, and takes it out."""
     @property

@@ -66,6 +66,7 @@ impl CommandColumns {
                 let first = tie.bites.first().map_or(NONE, |bite| from_vector(bite.place_m.as_ref()).to_array());
                 ("tie", first, NONE, -1)
             }
+            Some(Action::Mark(mark)) => ("mark", from_vector(mark.place_m.as_ref()).to_array(), NONE, -1),
             Some(Action::Release(_)) | None => ("release", NONE, NONE, -1),
         };
         self.step.push(step);

@@ -11,7 +11,7 @@ use palpate_session::simulation::Simulation;
 use palpate_session::snapshot::Saved;
 use palpate_tissue::Model;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::script::{Action, Mark};
 use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::scene::{self, Change};
 use palpate_tissue::shape::PointId;
@@ -51,8 +51,8 @@ impl SessionState {
     /// Gives a tool a command, which acts from the next step on.
     fn submit(&mut self, tool: u32, action: Action) -> Result<(), Refusal> {
         self.simulation.command(tool, action.clone())?;
-        // A thread or clip leaves the tool as it is.
-        if matches!(action, Action::Tie { .. }) {
+        // A thread, clip or mark leaves the tool as it is.
+        if matches!(action, Action::Tie { .. } | Action::Mark(_)) {
             return Ok(());
         }
         self.tips.remove(&tool);
@@ -289,6 +289,14 @@ impl Session {
     ) -> PyResult<()> {
         let tie = Tie { bites: bites(&bites_m, radius_m)?, kind: TieKind::Clip, strength_n };
         self.submit(py, tool, Action::Tie { number, tie: Some(tie) })
+    }
+
+    /// Marks a place of the surface, m, as an answer in an exercise: what you look for is there, or below it, and has about this
+    /// diameter, m. It changes nothing, and the tool does what it did.
+    #[pyo3(signature = (tool, place_m, *, diameter_m=None))]
+    fn mark(&self, py: Python<'_>, tool: u32, place_m: &Bound<'_, PyAny>, diameter_m: Option<f64>) -> PyResult<()> {
+        let place_m = vector("place_m", place_m)?;
+        self.submit(py, tool, Action::Mark(Mark { place_m, diameter_m }))
     }
 
     /// Cuts a thread or clip, and takes it out.

@@ -307,7 +307,7 @@ impl Intake {
             let is_position = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
                 Action::Pose { .. } => command.at_step.is_some() || command.client_time_ns == 0,
-                Action::Push(_) | Action::Tie { .. } | Action::Release => false,
+                Action::Push(_) | Action::Tie { .. } | Action::Mark(_) | Action::Release => false,
             };
             if let Some(last) = last.filter(|last| last.0 == step && is_position(&command))
                 && let Some(superseded) = self.queue.remove_if(command.tool, last, |due| is_position(&due.command))

@@ -51,7 +51,7 @@ use palpate_haptics::{LocalModel, MotionState, OtherTool, Tip};
 use palpate_tissue::memory;
 use palpate_tissue::scene::profile::{LoadProfile, MotionProfile, Poke};
 use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
-use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::script::{Action, Mark};
 use palpate_tissue::select::audit::{Mark, WindowInputs};
 use palpate_tissue::shape::{self, PointId, PointName};
 use palpate_tissue::{self as tissue, BlowUp, Energy, Grasp, Model, PointState, Push, ReadCopy, Tissue, ToolContact};
@@ -210,7 +210,22 @@ pub struct Session {
     path_counts: [u64; 3],
     recoveries: Recoveries,
     hold_reason: Option<String>,
+    marks: Vec<PlacedMark>,
 }
+
+/// A place that somebody marked on the surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlacedMark {
+    /// Number of steps done when it was made.
+    pub step: u64,
+    /// The tool whose holder made it.
+    pub tool: u32,
+    /// The mark.
+    pub mark: Mark,
+}
+
+/// Largest number of marks that a session keeps.
+const MAX_MARKS: usize = 1024;
 
 impl Session {
     /// Creates a session of a tissue at rest, at step 0, without tools. It unwinds with a refusal if there is no
@@ -224,6 +239,7 @@ impl Session {
             path_counts: [0; 3],
             recoveries: Recoveries::default(),
             hold_reason: None,
+            marks: Vec::new(),
         }
     }
 
@@ -274,6 +290,11 @@ impl Session {
     /// Returns the number of commands so far without effect because their tool was paused ([`recovery`]).
     pub fn paused_commands(&self) -> u64 {
         self.paused_commands
+    }
+
+    /// Returns the marks that were made since the session began or continued, in their order: at most 1024, further ones are ignored.
+    pub fn marks(&self) -> &[PlacedMark] {
+        &self.marks
     }
 
     /// Returns the tools that are led by poses now, by ascending number, with their tips; not those that have let go.
@@ -490,6 +511,14 @@ impl Session {
             tool.client_time_ns = command.client_time_ns;
             tool.arrival_ns = command.arrival_ns;
         }
+        if matches!(command.action, Action::Mark(_)) {
+            // The tissue and the tool stay as they are.
+            tool.late = late;
+            if let (Action::Mark(mark), true) = (command.action.with_unsigned_zeros(), self.marks.len() < MAX_MARKS) {
+                self.marks.push(PlacedMark { step, tool: command.tool, mark });
+            }
+            return;
+        }
         if matches!(command.action, Action::Tie { .. }) {
             // What the tool does goes on.
             if tool.paused_until.is_some_and(|end| step < end) {
@@ -565,7 +594,7 @@ impl Session {
                 self.path_counts[1] += u64::from(!is_taken);
             }
             // Done above.
-            Action::Tie { .. } => {}
+            Action::Tie { .. } | Action::Mark(_) => {}
             Action::Release => {
                 let tool = self.tool(index);
                 (tool.expires_at, tool.posed) = (None, None);

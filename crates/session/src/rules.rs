@@ -8,7 +8,7 @@ use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::rigid_tip_work;
 use palpate_tissue::scene::Scene;
-use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_reach, check_tie, check_tie_number};
+use palpate_tissue::scene::action_check::{self, check_free, check_mark, check_poke, check_reach, check_tie, check_tie_number};
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
 
@@ -69,7 +69,8 @@ impl Rules {
     ///   times its longest side;
     /// - a pose with a velocity that has no client time or has a step ([`Reason::Missing`]);
     /// - a tip that does not fit the tissue;
-    /// - a thread or clip that does not fit it ([`check_tie`]), or a number of one above `limits.ties`.
+    /// - a thread or clip that does not fit it ([`check_tie`]), or a number of one above `limits.ties`;
+    /// - a mark off the tissue ([`check_mark`]).
     pub fn check_one(&self, command: &Command) -> Result<()> {
         if let Some(seconds) = command.time_to_live_s {
             positive("time_to_live_s", seconds)?;
@@ -97,6 +98,7 @@ impl Rules {
                 check_tie_number("tie.number", *number, &self.limits)?;
                 tie.as_ref().map_or(Ok(()), |tie| check_tie("tie", self.scene.shape(), tie, &self.limits))
             }
+            Action::Mark(mark) => check_mark("mark", self.scene.shape(), mark),
             Action::Release => Ok(()),
         }
     }
@@ -172,7 +174,7 @@ pub(super) fn leased_tip(before: Option<LeasedTip>, command: &Command) -> Option
     match &command.action {
         Action::Pose { tip, .. } => Some((*tip).into()),
         // The tool goes on.
-        Action::Tie { .. } => before,
+        Action::Tie { .. } | Action::Mark(_) => before,
         Action::Push(_) | Action::Grasp { .. } | Action::Release => None,
     }
 }

@@ -213,6 +213,7 @@ impl Session {
             path_counts: own.path_counts,
             recoveries: own.recoveries.restored(step, &checks)?,
             hold_reason: own.hold_reason.clone(),
+            marks: Vec::new(),
         })
     }
 

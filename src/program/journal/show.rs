@@ -90,6 +90,7 @@ fn kind(command: &pb::Command) -> &'static str {
         Some(Action::Tie(tie)) if tie.bites.is_empty() => "cuts a thread or clip",
         Some(Action::Tie(tie)) if tie.length_m.is_some() => "leads a thread",
         Some(Action::Tie(_)) => "leads a clip",
+        Some(Action::Mark(_)) => "marks a place",
         Some(Action::Release(_)) | None => "is released",
     }
 }
@@ -105,6 +106,7 @@ fn told(command: &pb::Command) -> String {
         Some(Action::Grasp(grasp)) => format!("{kind} point {} by {} m", grasp.point, vector(grasp.displacement_m)),
         Some(Action::Pose(pose)) => format!("{kind} at {} m", vector(pose.place_m)),
         Some(Action::Tie(tie)) => format!("{kind}, number {}", tie.number),
+        Some(Action::Mark(mark)) => format!("{kind}: {} m", vector(mark.place_m)),
         Some(Action::Release(_)) | None => kind.to_owned(),
     }
 }
@@ -187,6 +189,9 @@ fn in_json(input: &pb::Input) -> Value {
                     .collect();
                 line["tie"] = json!({ "number": tie.number, "bites": bites, "length_m": tie.length_m, "friction": tie.friction,
                     "strength_n": tie.strength_n });
+            }
+            Some(Action::Mark(mark)) => {
+                line["mark"] = json!({ "place_m": vector(mark.place_m), "diameter_m": mark.diameter_m });
             }
             Some(Action::Release(_)) | None => {}
         }

@@ -1,4 +1,4 @@
-//! The actions of a tool: push, grasp, pose, tie, release.
+//! The actions of a tool: push, grasp, pose, tie, mark, release.
 
 use glam::DVec3;
 
@@ -6,6 +6,15 @@ use super::profile::Poke;
 use super::tie::Tie;
 use crate::shape::PointId;
 use palpate_haptics::Tip;
+
+/// A place that a person marks on the surface: what they look for is there, or below it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mark {
+    /// The place, m, in the tissue's frame.
+    pub place_m: DVec3,
+    /// The diameter that they think it has, m; `None` if they don't say.
+    pub diameter_m: Option<f64>,
+}
 
 /// An action of a tool, which lasts until its next action. Its numbers are not checked here: see
 /// [`action_check`](super::action_check).
@@ -39,6 +48,8 @@ pub enum Action {
         /// What ties which bites; `None` cuts it and takes it out.
         tie: Option<Tie>,
     },
+    /// Marks a place of the surface, as an answer in an exercise: it changes nothing, and what the tool does goes on.
+    Mark(Mark),
     /// Ends the tool's action: it no longer pushes, grasps or touches.
     Release,
 }

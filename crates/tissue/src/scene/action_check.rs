@@ -3,6 +3,7 @@
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip, TipShape};
 
+use super::action::Mark;
 use super::profile::Poke;
 use super::tie::{Bite, MAX_BITES, Tie, TieKind};
 use crate::limits::Limits;
@@ -193,6 +194,19 @@ pub fn check_tie(field: &str, shape: &dyn RestShape, tie: &Tie, limits: &Limits)
         number(&format!("{field}.friction"), friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     }
     strength_n.map_or(Ok(()), |strength_n| physical(&format!("{field}.strength_n"), strength_n).map(drop))
+}
+
+/// Checks a mark; `field` is the key that a refusal gives.
+///
+/// # Errors
+/// Refuses a place off the tissue ([`Reason::OffTissue`]), and a diameter that is not above 0 or longer than the tissue's longest side.
+pub fn check_mark(field: &str, shape: &dyn RestShape, mark: &Mark) -> Result<()> {
+    finite_vector(&format!("{field}.place_m"), mark.place_m)?;
+    shape.check_place(&format!("{field}.place_m"), mark.place_m)?;
+    let Some(diameter_m) = mark.diameter_m else { return Ok(()) };
+    let most_m = shape.longest_side_m();
+    let range = format!("above 0 and at most {}, the longest side of the tissue", legible(most_m));
+    number(&format!("{field}.diameter_m"), diameter_m, &range, |v| v > 0.0 && v <= most_m).map(drop)
 }
 
 /// Checks the number of a tie.

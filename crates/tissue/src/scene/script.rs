@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::Change;
-pub use super::action::Action;
+pub use super::action::{Action, Mark};
 use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile, TieProfile};
 use super::record::{ContactRecord, InstrumentRecord, PortRecord, ToolRecord};
 use crate::shape::{PointId, RestShape};
@@ -68,6 +68,9 @@ pub struct Script {
     pub instruments: Vec<Arc<InstrumentProfile>>,
     /// Threads, then clips, in the order of the text: number k is entry k. The tool after the others lays them.
     pub ties: Vec<TieProfile>,
+    /// Marks, each with the step at whose beginning it is made, in the order of the text. The tool that lays threads and clips makes
+    /// them.
+    pub marks: Vec<(u64, Mark)>,
     /// Changes of the tissue, each with the step at whose beginning it takes effect, by strictly ascending
     /// step.
     pub changes: Vec<(u64, Change)>,
@@ -128,7 +131,7 @@ impl Script {
             };
             Some((first + index, action))
         });
-        poses.chain(self.ties_at(step))
+        poses.chain(self.ties_at(step)).chain(self.marks_at(step))
     }
 
     /// Returns what lays, changes and cuts threads and clips at step `step`.
@@ -141,7 +144,13 @@ impl Script {
         })
     }
 
-    /// Returns the number of tools that act by themselves, without the one that lays threads and clips.
+    /// Returns the marks that are made at step `step`.
+    fn marks_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
+        let due = self.marks.iter().filter(move |mark| mark.0 == step);
+        due.map(|mark| (self.tool_count(), Action::Mark(mark.1)))
+    }
+
+    /// Returns the number of tools that act by themselves, without the one that lays threads and clips and makes marks.
     fn tool_count(&self) -> usize {
         self.forces.len() + self.moves.len() + self.poses.len()
     }
@@ -205,6 +214,6 @@ impl Script {
 
     /// Returns the number of tools that the script uses: theirs are 0 to this − 1.
     pub fn tools(&self) -> usize {
-        self.tool_count() + usize::from(!self.ties.is_empty())
+        self.tool_count() + usize::from(!self.ties.is_empty() || !self.marks.is_empty())
     }
 }

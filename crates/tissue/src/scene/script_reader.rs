@@ -11,6 +11,7 @@ use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Port, Tip, TipShape};
 
+use super::action::Mark;
 use super::kind::TextKind;
 use super::profile::{
     CentreProfile, InstrumentProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile,
@@ -20,7 +21,7 @@ use super::script::Script;
 use super::{Change, Scene};
 use crate::files;
 use crate::limits::Limits;
-use crate::scene::action_check::{check_force, check_free, check_reach, check_tie, check_tip};
+use crate::scene::action_check::{check_force, check_free, check_mark, check_reach, check_tie, check_tip};
 use crate::scene::tie::{Bite, Tie, TieKind};
 use crate::scene::toml_document::{Document, Fields, Item};
 use crate::shape::{self, PointId};
@@ -68,6 +69,9 @@ const SHORTEST_MOVE_S: f64 = 1e-6;
 
 /// The smallest allowed sum of the weights of a force with a radius.
 const MIN_WEIGHT: f64 = 1e-3;
+
+/// Largest number of marks of a script.
+const MAX_MARKS: usize = 1024;
 
 /// Highest frequency, Hz. Beyond it, a phase has no digits left.
 const HIGHEST_HZ: f64 = 1e6;
@@ -129,6 +133,7 @@ impl Binding<'_> {
             instruments.push(profile);
         }
         let ties = self.ties(fields)?;
+        let marks = self.marks(fields)?;
         control_points.extend(moves.iter().map(|profile| profile.point));
         // A row of tips would make many.
         let of_tools = poses.iter().filter(|profile: &&PoseProfile| profile.mounted.is_none());
@@ -142,11 +147,11 @@ impl Binding<'_> {
             }
         }
         let changes = self.changes(&items(fields, "tissue")?)?;
-        let tools = forces.len() + moves.len() + poses.len() + usize::from(!ties.is_empty());
+        let tools = forces.len() + moves.len() + poses.len() + usize::from(!ties.is_empty() || !marks.is_empty());
         if tools > self.limits.tools as usize {
             let message = format!(
                 "a script uses {tools} tools (one for each [[force]], each [[tool]] and each tip of an [[instrument]], and one for all \
-                 threads and clips), above the limit of {}",
+                 threads, clips and marks), above the limit of {}",
                 self.limits.tools
             );
             return Err(Refusal::new(Reason::TooLarge, "force", message));
@@ -168,6 +173,7 @@ impl Binding<'_> {
             poses,
             instruments,
             ties,
+            marks,
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
@@ -606,6 +612,26 @@ impl Binding<'_> {
             return Err(Refusal::new(Reason::TooLarge, "thread", message));
         }
         Ok(ties)
+    }
+
+    /// Reads the marks that a trainee makes.
+    fn marks(&mut self, fields: &mut Fields<'_>) -> Result<Vec<(u64, Mark)>> {
+        let mut marks = Vec::new();
+        for item in items(fields, "mark")? {
+            marks.push(item.table(|fields| {
+                let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                let step = self.steps(&fields.path("at_s"), at_s)?;
+                let place_m = fields.required("place_m")?.place_in(self.scene.shape().dimensions())?;
+                let mark = Mark { place_m, diameter_m: fields.number("diameter_m")? };
+                check_mark(fields.own_path(), self.scene.shape(), &mark)?;
+                Ok((step, mark))
+            })?);
+        }
+        if marks.len() > MAX_MARKS {
+            let message = format!("{} marks: more than {MAX_MARKS}", marks.len());
+            return Err(Refusal::new(Reason::TooLarge, "mark", message));
+        }
+        Ok(marks)
     }
 
     /// Reads a thread, whose length is a number or a list of lengths over time.
