@@ -5,6 +5,7 @@ pub mod cell_surface;
 mod curvature;
 pub mod decimate;
 pub mod delaunay;
+pub mod dice;
 pub mod fill;
 pub mod format;
 mod join;

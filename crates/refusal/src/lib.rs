@@ -52,6 +52,8 @@ reasons! {
     UnknownScene = "UNKNOWN_SCENE",
     /// No script has this name.
     UnknownScript = "UNKNOWN_SCRIPT",
+    /// No exercise has this name.
+    UnknownExercise = "UNKNOWN_EXERCISE",
     /// No session has this ID.
     UnknownSession = "UNKNOWN_SESSION",
     /// The session existed and has been deleted.

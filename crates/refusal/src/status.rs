@@ -42,6 +42,7 @@ pub fn code(reason: Reason) -> Code {
         Reason::TimedOut => Code::DeadlineExceeded,
         Reason::UnknownScene
         | Reason::UnknownScript
+        | Reason::UnknownExercise
         | Reason::UnknownMesh
         | Reason::UnknownJournal
         | Reason::UnknownSession

@@ -6,9 +6,9 @@ use std::f64::consts::TAU;
 
 use glam::{BVec3, DVec2, DVec3};
 
-use super::dice::Dice;
 use super::field::{Unevenness, bump, step};
 use super::shape::{Chart, Shape};
+use crate::dice::Dice;
 
 /// Its length along x, mm.
 const LENGTH: f64 = 200.0;

@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use glam::{DVec3, DVec4, Vec4Swizzles};
 
-use super::dice::Dice;
+use crate::dice::Dice;
 
 /// Returns the distance of the union of two solids, with a fillet of `width` mm where they meet (quadratic smooth
 /// minimum, Quilez).

@@ -2,9 +2,9 @@
 
 use glam::{BVec3, DVec3};
 
-use super::dice::Dice;
 use super::field::{Spine, Unevenness, ball, intersection, union};
 use super::shape::{Shape, sides};
+use crate::dice::Dice;
 
 /// Returns the shape of the gallbladder. The fundus is at x = 0, the duct beyond x = 60; the liver is above (z).
 pub(super) fn shape(dice: &mut Dice) -> Shape {

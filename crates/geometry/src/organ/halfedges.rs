@@ -262,7 +262,7 @@ impl HalfEdges {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::organ::dice::Dice;
+    use crate::dice::Dice;
 
     /// A grid of squares, closed to a torus if `closed`.
     fn grid(side: u32, closed: bool) -> (usize, Vec<[u32; 3]>) {

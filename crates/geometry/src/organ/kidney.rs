@@ -2,9 +2,9 @@
 
 use glam::{BVec3, DVec3};
 
-use super::dice::Dice;
 use super::field::{Spine, Unevenness, capsule, difference, ellipsoid, union};
 use super::shape::{Shape, sides};
+use crate::dice::Dice;
 
 /// Returns the shape of the kidney. x runs from the upper to the lower pole, y outward from the spine, z to the
 /// front.

@@ -2,9 +2,9 @@
 
 use glam::{BVec3, DVec2, DVec3};
 
-use super::dice::Dice;
 use super::field::{Unevenness, bump, capsule, difference, ellipsoid, intersection, union};
 use super::shape::{Shape, sides};
+use crate::dice::Dice;
 
 /// Returns the shape of the liver. x points to the body's left, y to its back, z up.
 pub(super) fn shape(dice: &mut Dice) -> Shape {

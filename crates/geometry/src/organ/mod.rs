@@ -5,7 +5,6 @@
 //! one function; [`Organ`] lists them. An organ, edge length and seed give equal bits on every machine.
 
 mod colon;
-mod dice;
 mod field;
 mod gallbladder;
 mod halfedges;
@@ -22,7 +21,7 @@ mod stomach;
 use std::fmt;
 use std::str::FromStr;
 
-use dice::Dice;
+use crate::dice::Dice;
 use net::Net;
 use remesh::Remesh;
 use shape::Shape;

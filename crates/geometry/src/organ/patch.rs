@@ -2,9 +2,9 @@
 
 use glam::{BVec3, DVec2, DVec3};
 
-use super::dice::Dice;
 use super::field::{Unevenness, bump};
 use super::shape::{Shape, sides};
+use crate::dice::Dice;
 
 /// Half its side, mm.
 const HALF: f64 = 50.0;

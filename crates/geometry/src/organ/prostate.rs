@@ -2,9 +2,9 @@
 
 use glam::{BVec3, DVec3};
 
-use super::dice::Dice;
 use super::field::{Unevenness, capsule, difference, ellipsoid, intersection, union};
 use super::shape::{Shape, sides};
+use crate::dice::Dice;
 
 /// Height at which the front is cut flat, mm: there the pubic bone holds it.
 const FRONT: f64 = -13.0;

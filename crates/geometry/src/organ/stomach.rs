@@ -2,9 +2,9 @@
 
 use glam::{BVec3, DVec3};
 
-use super::dice::Dice;
 use super::field::{Spine, Unevenness, step, union};
 use super::shape::{Shape, sides};
+use crate::dice::Dice;
 
 /// Returns the shape of the stomach. x points to the body's left, y up, z to the front.
 pub(super) fn shape(dice: &mut Dice) -> Shape {

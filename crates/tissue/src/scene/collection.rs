@@ -1,8 +1,9 @@
-//! Finds scenes and scripts by name: the files `NAME.toml` of a folder, and the built-in texts.
+//! Finds scenes, scripts and exercises by name: the files `NAME.toml` of a folder, and the built-in texts.
 
 use std::path::{Path, PathBuf};
 
-use super::kind::{ORDER, TextKind};
+use super::exercise;
+use super::kind::TextKind;
 use super::script::{self, Script};
 use super::{BUILT_IN, Scene};
 use crate::files;
@@ -11,7 +12,7 @@ use crate::scene::script_reader::made_for;
 use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
 
-/// The scenes or the scripts that can be given by name: the files `NAME.toml` of a folder and the built-in
+/// The scenes, scripts or exercises that can be given by name: the files `NAME.toml` of a folder and the built-in
 /// ones. A name has letters and digits of ASCII, `-` and `_`. Each call reads the folder anew.
 #[derive(Debug, Clone)]
 pub struct Collection {
@@ -29,6 +30,7 @@ impl Collection {
         let built_in: &'static [_] = match kind {
             TextKind::Scene => &BUILT_IN,
             TextKind::Script => &script::BUILT_IN,
+            TextKind::Exercise => &exercise::BUILT_IN,
         };
         Collection { folder: folder.to_owned(), built_in, kind, names_files: false }
     }
@@ -36,7 +38,7 @@ impl Collection {
     /// Returns the collection for a user of a command-line program, not for clients: refusals may suggest a
     /// file of the working directory.
     #[must_use]
-    fn for_user(self) -> Self {
+    pub(super) fn for_user(self) -> Self {
         Collection { names_files: true, ..self }
     }
 
@@ -82,8 +84,9 @@ impl Collection {
 
     /// Refuses the text of a file of this folder if it is of the other kind.
     fn refuse_other_kind(&self, file: &str, text: &str) -> Result<()> {
-        if Document::parse(file, text).is_ok_and(|document| self.kind.check(&document).is_err()) {
-            let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced());
+        let other = Document::parse(file, text).ok().and_then(|document| self.kind.mistaken(&document));
+        if let Some(other) = other {
+            let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced(other));
             return Err(Refusal { place: Some(file.to_owned()), ..refusal });
         }
         Ok(())
@@ -145,7 +148,7 @@ impl Collection {
         let hint = if self.names_files && is_name(name) && Path::new(&file).is_file() {
             format!("; did you mean the file `{file}`?")
         } else if others.has(name) {
-            format!("; `{name}` is a {}: {ORDER}", self.kind.other().name())
+            format!("; `{name}` is a {}: {}", others.kind.name(), others.kind.advice())
         } else {
             let meant = did_you_mean(name, names.iter().map(String::as_str));
             let own =
@@ -156,18 +159,19 @@ impl Collection {
         let (reason, field) = match self.kind {
             TextKind::Scene => (Reason::UnknownScene, "scene_name"),
             TextKind::Script => (Reason::UnknownScript, "script_name"),
+            TextKind::Exercise => (Reason::UnknownExercise, "exercise_name"),
         };
         Refusal::new(reason, field, message)
     }
 }
 
 /// Returns whether `name` is a plain word, which can't lead out of the folder.
-fn is_name(name: &str) -> bool {
+pub(super) fn is_name(name: &str) -> bool {
     !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
 }
 
 /// Returns the name that a user gave as a path: a plain word that is not a file.
-fn name_in(path: &Path) -> Option<&str> {
+pub(super) fn name_in(path: &Path) -> Option<&str> {
     path.to_str().filter(|name| is_name(name) && !path.is_file())
 }
 

@@ -1,35 +1,40 @@
-//! Distinguishes scenes from scripts by their keys, because users often give one where the other is wanted.
+//! Tells scenes, scripts and exercises apart by their keys, because users often give one where another is wanted.
 
 use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Result};
 
-/// The kind of a TOML text in a file, folder or collection: scene or script.
+/// The kind of a TOML text in a file, folder or collection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextKind {
     /// Describes a tissue ([`Scene`](super::Scene)).
     Scene,
     /// Describes what is done to a tissue ([`Script`](super::script::Script)).
     Script,
+    /// Describes a task for a trainee ([`Exercise`](super::exercise::Exercise)).
+    Exercise,
 }
 
 /// Hint in refusals: the order of scene and script on the command line.
 pub(super) const ORDER: &str = "give the scene first, then the script (of `replay`: the script, then --scene)";
 
 impl TextKind {
-    /// Returns the word for this kind in messages: `"scene"` or `"script"`.
+    /// All kinds.
+    const ALL: [Self; 3] = [TextKind::Scene, TextKind::Script, TextKind::Exercise];
+
+    /// Returns the word for this kind in messages: `"scene"`, `"script"` or `"exercise"`.
     pub fn name(self) -> &'static str {
         match self {
             TextKind::Scene => "scene",
             TextKind::Script => "script",
+            TextKind::Exercise => "exercise",
         }
     }
 
-    /// Returns the other kind: script for scene, scene for script.
-    #[must_use]
-    pub fn other(self) -> Self {
+    /// Returns the advice for a text of this kind where another one is wanted.
+    pub(super) fn advice(self) -> &'static str {
         match self {
-            TextKind::Scene => TextKind::Script,
-            TextKind::Script => TextKind::Scene,
+            TextKind::Scene | TextKind::Script => ORDER,
+            TextKind::Exercise => "give it by --exercise",
         }
     }
 
@@ -37,23 +42,29 @@ impl TextKind {
     fn keys(self) -> &'static [&'static str] {
         match self {
             TextKind::Scene => &["sheet", "mesh", "springs", "anchor_springs", "damping", "volume", "stepping"],
-            TextKind::Script => &["scenes", "duration_s", "sample_every_s", "sample_points", "force", "tool", "tissue"],
+            TextKind::Script => &["duration_s", "sample_every_s", "sample_points", "force", "tool", "tissue"],
+            TextKind::Exercise => &["instructions", "lumps", "criterion", "coverage", "lift", "avoid", "time_limit_s"],
         }
     }
 
-    /// Returns the message for a text of the other kind that lies in the folder of this kind.
-    pub(super) fn misplaced(self) -> String {
-        let other = self.other().name();
+    /// Returns the kind of a document that has keys of another kind and none of this one.
+    pub(super) fn mistaken(self, document: &Document) -> Option<Self> {
+        let has_keys_of = |kind: TextKind| kind.keys().iter().any(|key| document.has(key));
+        let others = Self::ALL.into_iter().filter(|kind| *kind != self);
+        if has_keys_of(self) { None } else { others.into_iter().find(|kind| has_keys_of(*kind)) }
+    }
+
+    /// Returns the message for a text of `other` kind that lies in the folder of this kind.
+    pub(super) fn misplaced(self, other: Self) -> String {
+        let other = other.name();
         format!("is a {other} in the folder of {}s: move it to the folder of {other}s", self.name())
     }
 
-    /// Refuses a document that has keys of the other kind and none of this kind.
+    /// Refuses a document that has keys of another kind and none of this kind.
     pub(super) fn check(self, document: &Document) -> Result<()> {
-        let has_keys_of = |kind: TextKind| kind.keys().iter().any(|key| document.has(key));
-        if has_keys_of(self) || !has_keys_of(self.other()) {
-            return Ok(());
-        }
-        Err(document.refuse(Reason::WrongKind, format!("is a {}: {ORDER}", self.other().name())))
+        let Some(other) = self.mistaken(document) else { return Ok(()) };
+        let article = if other == TextKind::Exercise { "an" } else { "a" };
+        Err(document.refuse(Reason::WrongKind, format!("is {article} {}: {}", other.name(), other.advice())))
     }
 }
 

@@ -7,6 +7,8 @@ mod body;
 pub mod collection;
 mod cutting;
 mod eigenvalue;
+pub mod exercise;
+pub mod exercise_reader;
 pub mod graph;
 pub mod kind;
 mod material;

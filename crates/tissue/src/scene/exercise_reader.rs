@@ -1,0 +1,343 @@
+//! Reads an exercise from TOML, and checks it.
+
+use glam::DVec3;
+
+use super::collection::{Collection, is_name, name_in};
+use super::exercise::{
+    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, ExercisePhase, HiddenLumps, LiftTask,
+    MAX_PARTS, ShownValue,
+};
+use super::kind::TextKind;
+use super::toml_document::{Document, Fields, Item};
+use crate::files;
+use crate::limits::Limits;
+use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use std::path::Path;
+
+/// Folder of the exercises that a user of the programs can give by name.
+pub const EXERCISES: &str = "exercises";
+
+/// Reads the exercise that a user gave: the path of a file, or the name of one in ./exercises or of a built-in one. A plain word that
+/// is not a file of the working directory is a name.
+///
+/// # Errors
+/// Refuses an unknown name, a file that can't be read, and every text that [`Exercise::parse`] refuses.
+pub fn find_exercise(path: &Path, limits: &Limits) -> Result<Exercise> {
+    let (name, text) = match name_in(path) {
+        Some(name) => {
+            let scenes = Collection::new(TextKind::Scene, Path::new("scenes"));
+            Collection::new(TextKind::Exercise, Path::new(EXERCISES)).for_user().text(name, &scenes, limits)?
+        }
+        None => (path.display().to_string(), files::read_text(path, limits.file_bytes)?),
+    };
+    Exercise::parse(&name, &text)
+}
+
+impl Exercise {
+    /// Reads an exercise from TOML text. Refusals call the text `name`.
+    ///
+    /// # Errors
+    /// Refuses a text that is not TOML, a scene or a script, unknown and missing keys, values of the wrong kind or out of range, an
+    /// exercise without a scene, phases that don't ascend, names of criteria that occur twice, and lumps that have no room in their box.
+    pub fn parse(name: &str, text: &str) -> Result<Self> {
+        let document = Document::parse(name, text)?;
+        TextKind::Exercise.check(&document)?;
+        document.read(read)
+    }
+}
+
+fn read(fields: &mut Fields<'_>) -> Result<Exercise> {
+    let name = fields.required("name")?.text()?;
+    if !is_name(&name) {
+        let message = "must have letters and digits of ASCII, `-` and `_` only, like the name of its file";
+        return Err(fields.refuse(Reason::WrongKind, "name", message));
+    }
+    let exercise = Exercise {
+        title: fields.text("title")?.unwrap_or_else(|| name.clone()),
+        name,
+        instructions: fields.required("instructions")?.text()?.trim().to_owned(),
+        scenes: scenes(fields)?,
+        seed: fields.item("seed").map_or(Ok(1), |item| item.whole())?,
+        time_limit_s: positive_or_none(fields, "time_limit_s")?,
+        seen_along: seen_along(fields)?,
+        lumps: fields.item("lumps").map(|item| item.table(lumps)).transpose()?,
+        lines: parts(fields, "line")?.iter().map(|item| item.table(line)).collect::<Result<_>>()?,
+        avoid: parts(fields, "avoid")?.iter().map(|item| item.table(avoided)).collect::<Result<_>>()?,
+        lift: fields.item("lift").map(|item| item.table(lift)).transpose()?,
+        coverage: fields.item("coverage").map(|item| item.table(coverage)).transpose()?,
+        phases: phases(fields)?,
+        limits: fields.item("limits").map_or(Ok(ExerciseLimits::default()), |item| item.table(limits))?,
+        criteria: criteria(fields)?,
+        shows: shows(fields)?,
+    };
+    if exercise.lumps(exercise.seed).is_none() {
+        let message = "have no room in the box from `from_m` to `to_m`: make it larger, or the lumps fewer, smaller or less apart";
+        return Err(fields.refuse(Reason::OutOfRange, "lumps", message));
+    }
+    Ok(exercise)
+}
+
+/// Returns the entries of `[[key]]`, at most [`MAX_PARTS`]; none if the key is absent.
+fn parts<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
+    let items = fields.item(key).map_or(Ok(Vec::new()), |item| item.tables())?;
+    if items.len() > MAX_PARTS {
+        let message = format!("has {} entries, more than {MAX_PARTS}", items.len());
+        return Err(fields.refuse(Reason::TooLarge, key, message));
+    }
+    Ok(items)
+}
+
+fn positive_or_none(fields: &mut Fields<'_>, key: &'static str) -> Result<Option<f64>> {
+    let path = fields.path(key);
+    fields.number(key)?.map(|value| positive(&path, value)).transpose()
+}
+
+fn required_positive(fields: &mut Fields<'_>, key: &'static str) -> Result<f64> {
+    let path = fields.path(key);
+    positive(&path, fields.required_number(key)?)
+}
+
+/// Reads a number that is 0 or more.
+fn distance(fields: &mut Fields<'_>, key: &'static str, default: f64) -> Result<f64> {
+    let path = fields.path(key);
+    not_negative(&path, fields.number(key)?.unwrap_or(default))
+}
+
+fn scenes(fields: &mut Fields<'_>) -> Result<Vec<String>> {
+    let item = fields.required("scenes")?;
+    let scenes = item.list()?.iter().map(Item::text).collect::<Result<Vec<_>>>()?;
+    if scenes.is_empty() {
+        return Err(item.refuse(Reason::Missing, "must name at least one scene"));
+    }
+    Ok(scenes)
+}
+
+/// Reads a range: one number, or [least, most].
+fn range(fields: &mut Fields<'_>, key: &'static str, most: f64) -> Result<[f64; 2]> {
+    let item = fields.required(key)?;
+    let ends = match item.number() {
+        Ok(value) => [value; 2],
+        Err(_) => match item.list()?.iter().map(Item::number).collect::<Result<Vec<_>>>()?.as_slice() {
+            [least, most] => [*least, *most],
+            _ => return Err(item.wrong("a number, or [least, most]")),
+        },
+    };
+    let path = fields.path(key);
+    for end in ends {
+        number(&path, end, &format!("above 0 and at most {most}"), |v| v > 0.0 && v <= most)?;
+    }
+    if ends[0] > ends[1] {
+        return Err(item.refuse(Reason::OutOfRange, "must be [least, most], but the first is larger"));
+    }
+    Ok(ends)
+}
+
+fn count(fields: &mut Fields<'_>) -> Result<[u64; 2]> {
+    let item = fields.required("count")?;
+    let ends = match item.whole() {
+        Ok(count) => [count; 2],
+        Err(_) => match item.list()?.iter().map(Item::whole).collect::<Result<Vec<_>>>()?.as_slice() {
+            [least, most] => [*least, *most],
+            _ => return Err(item.wrong("a whole number, or [least, most]")),
+        },
+    };
+    if ends[0] > ends[1] || ends[1] > MAX_PARTS as u64 {
+        let message = format!("must be [least, most], both from 0 to {MAX_PARTS}, and least at most most");
+        return Err(item.refuse(Reason::OutOfRange, message));
+    }
+    Ok(ends)
+}
+
+/// Reads the direction along which the trainee looks; downwards by default.
+fn seen_along(fields: &mut Fields<'_>) -> Result<DVec3> {
+    let Some(item) = fields.item("seen_along") else { return Ok(DVec3::NEG_Z) };
+    let direction = item.vector()?.try_normalize();
+    direction.ok_or_else(|| item.refuse(Reason::OutOfRange, "must not be 0: it is a direction"))
+}
+
+/// Largest radius of a lump, m.
+const MAX_RADIUS_M: f64 = 1.0;
+
+fn lumps(fields: &mut Fields<'_>) -> Result<HiddenLumps> {
+    Ok(HiddenLumps {
+        count: count(fields)?,
+        radius_m: range(fields, "radius_m", MAX_RADIUS_M)?,
+        stiffness_factor: range(fields, "stiffness_factor", 100.0)?,
+        from_m: fields.required("from_m")?.vector()?,
+        to_m: fields.required("to_m")?.vector()?,
+        apart_m: distance(fields, "apart_m", 0.0)?,
+        found_within_m: distance(fields, "found_within_m", 0.0)?,
+    })
+}
+
+fn line(fields: &mut Fields<'_>) -> Result<CutLine> {
+    let item = fields.required("points_m")?;
+    let points_m = item.list()?.iter().map(Item::vector).collect::<Result<Vec<_>>>()?;
+    if !(2..=MAX_PARTS).contains(&points_m.len()) || points_m.windows(2).any(|ends| ends[0] == ends[1]) {
+        let message = format!("must be 2 to {MAX_PARTS} places, each other than the one before it");
+        return Err(item.refuse(Reason::OutOfRange, message));
+    }
+    Ok(CutLine { points_m, within_m: required_positive(fields, "within_m")? })
+}
+
+fn avoided(fields: &mut Fields<'_>) -> Result<AvoidedRegion> {
+    Ok(AvoidedRegion {
+        centre_m: fields.required("centre_m")?.vector()?,
+        radius_m: required_positive(fields, "radius_m")?,
+    })
+}
+
+fn lift(fields: &mut Fields<'_>) -> Result<LiftTask> {
+    Ok(LiftTask {
+        place_m: fields.required("place_m")?.vector()?,
+        height_m: required_positive(fields, "height_m")?,
+        hold_s: required_positive(fields, "hold_s")?,
+    })
+}
+
+fn coverage(fields: &mut Fields<'_>) -> Result<CoverageTask> {
+    Ok(CoverageTask { pressure_pa: required_positive(fields, "pressure_pa")? })
+}
+
+fn limits(fields: &mut Fields<'_>) -> Result<ExerciseLimits> {
+    Ok(ExerciseLimits {
+        force_n: positive_or_none(fields, "force_n")?,
+        pressure_pa: positive_or_none(fields, "pressure_pa")?,
+    })
+}
+
+fn phases(fields: &mut Fields<'_>) -> Result<Vec<ExercisePhase>> {
+    let phase = |fields: &mut Fields<'_>| {
+        Ok(ExercisePhase { name: fields.required("name")?.text()?, from_s: distance(fields, "from_s", 0.0)? })
+    };
+    let phases = parts(fields, "phase")?.iter().map(|item| item.table(phase)).collect::<Result<Vec<_>>>()?;
+    if let Some(index) = phases.windows(2).position(|pair| pair[1].from_s <= pair[0].from_s) {
+        let message = format!("{} must begin after the one before it", index + 1);
+        return Err(fields.refuse(Reason::OutOfRange, "phase", message));
+    }
+    Ok(phases)
+}
+
+fn criteria(fields: &mut Fields<'_>) -> Result<Vec<Criterion>> {
+    let criterion = |fields: &mut Fields<'_>| {
+        let (poor, good) = (fields.required_number("poor")?, fields.required_number("good")?);
+        if poor == good {
+            let message = "must differ from `poor`: between both the points are in proportion";
+            return Err(fields.refuse(Reason::OutOfRange, "good", message));
+        }
+        let path = fields.path("weight");
+        let weight = positive(&path, fields.number("weight")?.unwrap_or(1.0))?;
+        Ok(Criterion { measure: fields.required("measure")?.text()?, weight, poor, good })
+    };
+    let criteria = parts(fields, "criterion")?.iter().map(|item| item.table(criterion)).collect::<Result<Vec<_>>>()?;
+    for (index, criterion) in criteria.iter().enumerate() {
+        if criteria[..index].iter().any(|other| other.measure == criterion.measure) {
+            let field = format!("criterion[{index}].measure");
+            return Err(Refusal::new(Reason::OutOfRange, field, "occurs twice: give each measure one weight"));
+        }
+    }
+    Ok(criteria)
+}
+
+fn shows(fields: &mut Fields<'_>) -> Result<Vec<ShownValue>> {
+    let Some(item) = fields.item("shows") else { return Ok(ShownValue::ALL.to_vec()) };
+    let value = |item: &Item<'_>| {
+        let name = item.text()?;
+        let value = ShownValue::ALL.into_iter().find(|value| value.name() == name);
+        value.ok_or_else(|| item.wrong(&format!("one of {}", ShownValue::ALL.map(ShownValue::name).join(", "))))
+    };
+    item.list()?.iter().map(value).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::exercise::BUILT_IN;
+    use super::*;
+
+    const LUMPS: &str = r#"
+name = "mine"
+instructions = "Find them."
+scenes = ["phantom"]
+[lumps]
+count = [1, 3]
+radius_m = [0.005, 0.008]
+stiffness_factor = 5
+from_m = [-0.03, -0.03, 0.02]
+to_m = [0.03, 0.03, 0.03]
+apart_m = 0.01
+"#;
+
+    #[test]
+    fn shipped_exercises_are_read_and_have_the_names_of_their_files() {
+        for (name, text) in BUILT_IN {
+            let exercise = Exercise::parse(name, text).unwrap_or_else(|refusal| panic!("{refusal}"));
+            assert_eq!(exercise.name, name);
+            assert!(!exercise.criteria.is_empty() && exercise.instructions.len() > 40, "{name}");
+        }
+        assert!(BUILT_IN.is_sorted_by_key(|(name, _)| *name));
+    }
+
+    #[test]
+    fn lumps_of_a_seed_are_the_same_and_keep_their_distance_in_their_box() {
+        let exercise = Exercise::parse("mine.toml", LUMPS).unwrap();
+        let hidden = exercise.lumps.as_ref().unwrap();
+        let mut counts = [0; 4];
+        for seed in 0..200 {
+            let lumps = exercise.lumps(seed).unwrap();
+            assert_eq!(lumps, exercise.lumps(seed).unwrap());
+            counts[lumps.len()] += 1;
+            for (index, lump) in lumps.iter().enumerate() {
+                assert!(lump.centre_m.cmpge(hidden.from_m).all() && lump.centre_m.cmple(hidden.to_m).all(), "{lump:?}");
+                assert!((0.005..=0.008).contains(&lump.radius_m) && lump.stiffness_factor == 5.0, "{lump:?}");
+                for other in &lumps[..index] {
+                    let gap_m = other.centre_m.distance(lump.centre_m) - other.radius_m - lump.radius_m;
+                    assert!(gap_m >= 0.01, "{gap_m}");
+                }
+            }
+        }
+        assert!(counts[0] == 0 && counts[1..].iter().all(|count| *count > 40), "{counts:?}");
+        // A scene takes what is drawn.
+        let assignments = exercise.assignments(&exercise.lumps(1).unwrap());
+        let scene = super::super::collection::find_scene(
+            Path::new("phantom"),
+            Path::new("no-such-folder"),
+            &assignments,
+            &Limits::default(),
+        );
+        assert!(scene.is_ok(), "{scene:?}");
+    }
+
+    #[test]
+    fn what_is_wrong_in_an_exercise_is_named_with_its_line() {
+        for (from, to, wanted) in [
+            ("count = [1, 3]", "count = [3, 1]", "mine.toml:6: lumps.count: must be [least, most]"),
+            ("count = [1, 3]", "count = [1, 3]\ncolour = 1", "mine.toml:7: lumps.colour: unknown key"),
+            (
+                "radius_m = [0.005, 0.008]",
+                "radius_m = [0.005]",
+                "mine.toml:7: lumps.radius_m: must be a number, or [least, most]",
+            ),
+            ("apart_m = 0.01", "apart_m = 1.0", "mine.toml:5: lumps: have no room in the box"),
+            ("apart_m = 0.01", "apart_m = -1.0", "mine.toml:11: lumps.apart_m"),
+            ("scenes = [\"phantom\"]", "scenes = []", "mine.toml:4: scenes: must name at least one scene"),
+            ("scenes = [\"phantom\"]", "", "mine.toml:1: scenes: is missing"),
+            ("name = \"mine\"", "name = \"my own\"", "mine.toml:2: name: must have letters"),
+            (
+                "[lumps]",
+                "shows = [\"all\"]\n[lumps]",
+                "mine.toml:5: shows[0]: must be one of time, force, measures, score",
+            ),
+            (
+                "[lumps]",
+                "[[criterion]]\nmeasure = \"time_s\"\npoor = 1\ngood = 1\n[lumps]",
+                "mine.toml:8: criterion[0].good: must differ",
+            ),
+        ] {
+            assert!(LUMPS.contains(from), "{from}");
+            let refusal = Exercise::parse("mine.toml", &LUMPS.replacen(from, to, 1)).unwrap_err().to_string();
+            assert!(refusal.starts_with(wanted), "{refusal}\nwanted {wanted}");
+        }
+        let scene = Exercise::parse("mine.toml", "[sheet]\npoints = [3, 3]\n").unwrap_err().to_string();
+        assert!(scene.starts_with("mine.toml: is a scene"), "{scene}");
+    }
+}
