@@ -414,6 +414,36 @@ fn three_stitches_close_a_wound_while_its_lips_are_drawn_apart() {
     assert_eq!(told.as_array().unwrap().len(), 3, "{told}");
 }
 
+/// A blade that stands upright in a block goes from one side of it to the other, in each of some planes.
+#[test]
+fn a_run_warns_if_its_blade_leaves_a_solid_no_room_for_further_cuts() {
+    let text = "[solid]\norgan = { name = \"phantom\", edge_m = 0.006, seed = 1 }\ncell_m = 0.01\n\
+                fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
+                [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\n[stepping]\nsubsteps = 4\n";
+    let scene = Scene::parse("block", text, &[], &Limits::default()).unwrap();
+    let model = model(&scene);
+    let is_warned = |planes_x_m: &[f64]| {
+        let mut poses = String::new();
+        for (plane, x_m) in planes_x_m.iter().enumerate() {
+            for end in 0..2 {
+                let at_s = 0.1 * plane as f64 + 0.08 * f64::from(end);
+                let y_m = if end == plane as u32 % 2 { -0.06 } else { 0.06 };
+                let upright = "orientation = [0.70710678, 0, 0.70710678, 0]";
+                poses += &format!("{{ at_s = {at_s:?}, place_m = [{x_m:?}, {y_m:?}, 0.005], {upright} }},\n");
+            }
+        }
+        let duration_s = 0.1 * planes_x_m.len() as f64;
+        let text = format!(
+            "duration_s = {duration_s:?}\nsample_every_s = 0.1\n[[tool]]\nblade = {{ length_m = 0.06 }}\nposes = [\n{poses}]\n"
+        );
+        let (_, summary) = run_whole(&model, &script(&text, &scene), false);
+        assert!(summary.topology.is_some_and(|topology| topology.severed > 20), "{summary:?}");
+        summary.warnings.iter().any(|warning| warning.contains("no spare places"))
+    };
+    assert!(!is_warned(&[0.004]));
+    assert!(is_warned(&[-0.026, -0.006, 0.014, 0.034]));
+}
+
 /// A tip that rests on the liver from its first pose on, and is taken away at `until_s`.
 fn cautery(burn_s: f64, until_s: f64) -> String {
     format!(

@@ -1348,6 +1348,10 @@ pub struct Sample {
     /// tips are also among `other_tools`, while they are near the tissue.
     #[prost(message, repeated, tag = "18")]
     pub other_instruments: ::prost::alloc::vec::Vec<OtherInstrument>,
+    /// Whether a solid has no spare place left for the corners that one more severed face could double: then blades only push. Others
+    /// always have room.
+    #[prost(bool, tag = "19")]
+    pub cuts_exhausted: bool,
 }
 impl ::prost::Name for Sample {
     const NAME: &'static str = "Sample";
@@ -3880,6 +3884,12 @@ pub struct Session {
     /// Number of parts of the tissue; 1 if it is whole.
     #[prost(uint32, tag = "38")]
     pub pieces: u32,
+    /// The threads and clips, by ascending number, at most 32 steps old.
+    #[prost(message, repeated, tag = "39")]
+    pub ties: ::prost::alloc::vec::Vec<LaidTie>,
+    /// As Sample.cuts_exhausted.
+    #[prost(bool, tag = "40")]
+    pub cuts_exhausted: bool,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";
@@ -3889,6 +3899,36 @@ impl ::prost::Name for Session {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Session".into()
+    }
+}
+/// A thread or clip of a session.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct LaidTie {
+    /// As it was laid or last changed.
+    #[prost(message, optional, tag = "1")]
+    pub tie: ::core::option::Option<Tie>,
+    /// Length of the thread without its stretch: above `length_m` of `tie` while it is drawn in. Of a clip how far it is from being
+    /// closed.
+    #[prost(double, tag = "2")]
+    pub length_m: f64,
+    /// Sum of the distances between successive bites.
+    #[prost(double, tag = "3")]
+    pub path_m: f64,
+    /// The largest tension between two bites in the last step.
+    #[prost(double, tag = "4")]
+    pub tension_n: f64,
+    /// Whether it has broken, and no longer holds anything.
+    #[prost(bool, tag = "5")]
+    pub broken: bool,
+}
+impl ::prost::Name for LaidTie {
+    const NAME: &'static str = "LaidTie";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.LaidTie".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.LaidTie".into()
     }
 }
 /// The error of a solid's cells under a finger that presses the middle of the tissue, slowly and little, estimated by the

@@ -305,6 +305,7 @@ Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 16, is_list: true, kind: FieldKind::Message(52) },
 Field { number: 17, is_list: true, kind: FieldKind::Message(47) },
 Field { number: 18, is_list: true, kind: FieldKind::Message(49) },
+Field { number: 19, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.InstrumentSample", bytes: size_of::<crate::pb::InstrumentSample>(), decode: |bytes| <crate::pb::InstrumentSample as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -608,7 +609,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.UploadJournalResponse", bytes: size_of::<crate::pb::UploadJournalResponse>(), decode: |bytes| <crate::pb::UploadJournalResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(136) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(137) },
 ] },
 Shape { name: "palpate.v1.MeshReport", bytes: size_of::<crate::pb::MeshReport>(), decode: |bytes| <crate::pb::MeshReport as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -664,7 +665,7 @@ Field { number: 9, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 11, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Text },
-Field { number: 13, is_list: true, kind: FieldKind::Message(111) },
+Field { number: 13, is_list: true, kind: FieldKind::Message(112) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 15, is_list: true, kind: FieldKind::Text },
 Field { number: 16, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -676,20 +677,29 @@ Field { number: 21, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 22, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 23, is_list: false, kind: FieldKind::Text },
 Field { number: 24, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 25, is_list: false, kind: FieldKind::Message(110) },
-Field { number: 26, is_list: false, kind: FieldKind::Message(107) },
+Field { number: 25, is_list: false, kind: FieldKind::Message(111) },
+Field { number: 26, is_list: false, kind: FieldKind::Message(108) },
 Field { number: 27, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 28, is_list: true, kind: FieldKind::Message(106) },
+Field { number: 28, is_list: true, kind: FieldKind::Message(107) },
 Field { number: 29, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 30, is_list: false, kind: FieldKind::Message(8) },
-Field { number: 31, is_list: false, kind: FieldKind::Message(105) },
-Field { number: 32, is_list: false, kind: FieldKind::Message(104) },
-Field { number: 33, is_list: false, kind: FieldKind::Message(101) },
-Field { number: 34, is_list: true, kind: FieldKind::Message(100) },
-Field { number: 35, is_list: false, kind: FieldKind::Message(99) },
+Field { number: 31, is_list: false, kind: FieldKind::Message(106) },
+Field { number: 32, is_list: false, kind: FieldKind::Message(105) },
+Field { number: 33, is_list: false, kind: FieldKind::Message(102) },
+Field { number: 34, is_list: true, kind: FieldKind::Message(101) },
+Field { number: 35, is_list: false, kind: FieldKind::Message(100) },
 Field { number: 36, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 37, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 38, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 39, is_list: true, kind: FieldKind::Message(99) },
+Field { number: 40, is_list: false, kind: FieldKind::Number(1, 0) },
+] },
+Shape { name: "palpate.v1.LaidTie", bytes: size_of::<crate::pb::LaidTie>(), decode: |bytes| <crate::pb::LaidTie as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Message(11) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.MeshErrorEstimate", bytes: size_of::<crate::pb::MeshErrorEstimate>(), decode: |bytes| <crate::pb::MeshErrorEstimate as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -712,7 +722,7 @@ Shape { name: "palpate.v1.LocateSessionRequest", bytes: size_of::<crate::pb::Loc
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.LocateSessionResponse", bytes: size_of::<crate::pb::LocateSessionResponse>(), decode: |bytes| <crate::pb::LocateSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(101) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(102) },
 ] },
 Shape { name: "palpate.v1.Playback", bytes: size_of::<crate::pb::Playback>(), decode: |bytes| <crate::pb::Playback as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -739,12 +749,12 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 Shape { name: "palpate.v1.Audit", bytes: size_of::<crate::pb::Audit>(), decode: |bytes| <crate::pb::Audit as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(108) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(108) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(109) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(109) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(109) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(110) },
 Field { number: 9, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.AuditedError", bytes: size_of::<crate::pb::AuditedError>(), decode: |bytes| <crate::pb::AuditedError as Message>::decode(bytes).is_ok(), fields: &[
@@ -753,7 +763,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.Correction", bytes: size_of::<crate::pb::Correction>(), decode: |bytes| <crate::pb::Correction as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(108) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(109) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Text },
 Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -847,7 +857,7 @@ Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListJournalsRequest", bytes: size_of::<crate::pb::ListJournalsRequest>(), decode: |bytes| <crate::pb::ListJournalsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListJournalsResponse", bytes: size_of::<crate::pb::ListJournalsResponse>(), decode: |bytes| <crate::pb::ListJournalsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(134) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(135) },
 ] },
 Shape { name: "palpate.v1.JournalInfo", bytes: size_of::<crate::pb::JournalInfo>(), decode: |bytes| <crate::pb::JournalInfo as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -865,11 +875,11 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.GetJournalResponse", bytes: size_of::<crate::pb::GetJournalResponse>(), decode: |bytes| <crate::pb::GetJournalResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(134) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(135) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(137) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(138) },
 Field { number: 6, is_list: true, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.ForceMoment", bytes: size_of::<crate::pb::ForceMoment>(), decode: |bytes| <crate::pb::ForceMoment as Message>::decode(bytes).is_ok(), fields: &[
@@ -895,7 +905,7 @@ Field { number: 5, is_list: true, kind: FieldKind::Number(4, 4) },
 Field { number: 6, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: true, kind: FieldKind::Number(4, 0) },
-Field { number: 9, is_list: true, kind: FieldKind::Message(142) },
+Field { number: 9, is_list: true, kind: FieldKind::Message(143) },
 ] },
 Shape { name: "palpate.v1.VertexGroup", bytes: size_of::<crate::pb::VertexGroup>(), decode: |bytes| <crate::pb::VertexGroup as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -908,7 +918,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.GetTopologyResponse", bytes: size_of::<crate::pb::GetTopologyResponse>(), decode: |bytes| <crate::pb::GetTopologyResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(145) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(146) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
@@ -928,8 +938,8 @@ Shape { name: "palpate.v1.GetWoundResponse", bytes: size_of::<crate::pb::GetWoun
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(148) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(149) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(149) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(150) },
 Field { number: 6, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
@@ -979,7 +989,7 @@ Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 13, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 15, is_list: true, kind: FieldKind::Message(154) },
+Field { number: 15, is_list: true, kind: FieldKind::Message(155) },
 Field { number: 16, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 17, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
@@ -999,7 +1009,7 @@ Shape { name: "palpate.v1.AcknowledgeFramesResponse", bytes: size_of::<crate::pb
 Shape { name: "palpate.v1.ListNodesRequest", bytes: size_of::<crate::pb::ListNodesRequest>(), decode: |bytes| <crate::pb::ListNodesRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListNodesResponse", bytes: size_of::<crate::pb::ListNodesResponse>(), decode: |bytes| <crate::pb::ListNodesResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(159) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(160) },
 ] },
 Shape { name: "palpate.v1.Node", bytes: size_of::<crate::pb::Node>(), decode: |bytes| <crate::pb::Node as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1014,11 +1024,11 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListFleetSessionsRequest", bytes: size_of::<crate::pb::ListFleetSessionsRequest>(), decode: |bytes| <crate::pb::ListFleetSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListFleetSessionsResponse", bytes: size_of::<crate::pb::ListFleetSessionsResponse>(), decode: |bytes| <crate::pb::ListFleetSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(162) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(163) },
 ] },
 Shape { name: "palpate.v1.FleetSession", bytes: size_of::<crate::pb::FleetSession>(), decode: |bytes| <crate::pb::FleetSession as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(101) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(102) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.MoveSessionRequest", bytes: size_of::<crate::pb::MoveSessionRequest>(), decode: |bytes| <crate::pb::MoveSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1026,7 +1036,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MoveSessionResponse", bytes: size_of::<crate::pb::MoveSessionResponse>(), decode: |bytes| <crate::pb::MoveSessionResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(101) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(102) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.DrainNodeRequest", bytes: size_of::<crate::pb::DrainNodeRequest>(), decode: |bytes| <crate::pb::DrainNodeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1041,7 +1051,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.ListCallersRequest", bytes: size_of::<crate::pb::ListCallersRequest>(), decode: |bytes| <crate::pb::ListCallersRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListCallersResponse", bytes: size_of::<crate::pb::ListCallersResponse>(), decode: |bytes| <crate::pb::ListCallersResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(169) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(170) },
 ] },
 Shape { name: "palpate.v1.CallerUse", bytes: size_of::<crate::pb::CallerUse>(), decode: |bytes| <crate::pb::CallerUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1055,7 +1065,7 @@ Shape { name: "palpate.v1.ListStreamsRequest", bytes: size_of::<crate::pb::ListS
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.ListStreamsResponse", bytes: size_of::<crate::pb::ListStreamsResponse>(), decode: |bytes| <crate::pb::ListStreamsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(172) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(173) },
 ] },
 Shape { name: "palpate.v1.StreamUse", bytes: size_of::<crate::pb::StreamUse>(), decode: |bytes| <crate::pb::StreamUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
@@ -1100,15 +1110,15 @@ Shape { name: "palpate.v1.CreateHereResponse", bytes: size_of::<crate::pb::Creat
 Field { number: 1, is_list: false, kind: FieldKind::Message(98) },
 ] },
 Shape { name: "palpate.v1.MirrorRequest", bytes: size_of::<crate::pb::MirrorRequest>(), decode: |bytes| <crate::pb::MirrorRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(184) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(185) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(187) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(185) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(186) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(188) },
 ] },
 Shape { name: "palpate.v1.MirrorOpen", bytes: size_of::<crate::pb::MirrorOpen>(), decode: |bytes| <crate::pb::MirrorOpen as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorParts", bytes: size_of::<crate::pb::MirrorParts>(), decode: |bytes| <crate::pb::MirrorParts as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(186) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(187) },
 ] },
 Shape { name: "palpate.v1.MirrorPart", bytes: size_of::<crate::pb::MirrorPart>(), decode: |bytes| <crate::pb::MirrorPart as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1120,7 +1130,7 @@ Shape { name: "palpate.v1.MirrorEnd", bytes: size_of::<crate::pb::MirrorEnd>(), 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorResponse", bytes: size_of::<crate::pb::MirrorResponse>(), decode: |bytes| <crate::pb::MirrorResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(189) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(190) },
 ] },
 Shape { name: "palpate.v1.Mirrored", bytes: size_of::<crate::pb::Mirrored>(), decode: |bytes| <crate::pb::Mirrored as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1129,13 +1139,13 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.TakeSessionRequest", bytes: size_of::<crate::pb::TakeSessionRequest>(), decode: |bytes| <crate::pb::TakeSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(191) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(192) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.TakeOver", bytes: size_of::<crate::pb::TakeOver>(), decode: |bytes| <crate::pb::TakeOver as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(193) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(192) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(194) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(193) },
 ] },
 Shape { name: "palpate.v1.KnownLaw", bytes: size_of::<crate::pb::KnownLaw>(), decode: |bytes| <crate::pb::KnownLaw as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1156,17 +1166,17 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(196) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(197) },
 ] },
 Shape { name: "palpate.journal.v1.Input", bytes: size_of::<crate::journal::Input>(), decode: |bytes| <crate::journal::Input as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(197) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(206) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(207) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(208) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(209) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(210) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(211) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(198) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(207) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(208) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(209) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(210) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(211) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(212) },
 ] },
 Shape { name: "palpate.journal.v1.Command", bytes: size_of::<crate::journal::Command>(), decode: |bytes| <crate::journal::Command as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1178,12 +1188,12 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(201) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(202) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(203) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(205) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(199) },
-Field { number: 15, is_list: false, kind: FieldKind::Message(198) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(202) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(203) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(204) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(206) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(200) },
+Field { number: 15, is_list: false, kind: FieldKind::Message(199) },
 ] },
 Shape { name: "palpate.journal.v1.Mark", bytes: size_of::<crate::journal::Mark>(), decode: |bytes| <crate::journal::Mark as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
@@ -1191,7 +1201,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.journal.v1.Tie", bytes: size_of::<crate::journal::Tie>(), decode: |bytes| <crate::journal::Tie as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(200) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(201) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1214,7 +1224,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
 Shape { name: "palpate.journal.v1.Pose", bytes: size_of::<crate::journal::Pose>(), decode: |bytes| <crate::journal::Pose as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(204) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(205) },
 ] },
 Shape { name: "palpate.journal.v1.Tip", bytes: size_of::<crate::journal::Tip>(), decode: |bytes| <crate::journal::Tip as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1265,23 +1275,23 @@ Shape { name: "palpate.journal.v1.Snapshot", bytes: size_of::<crate::journal::Sn
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(206) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(207) },
 Field { number: 5, is_list: false, kind: FieldKind::Text },
 Field { number: 6, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Felt", bytes: size_of::<crate::journal::Felt>(), decode: |bytes| <crate::journal::Felt as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(215) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(216) },
 ] },
 Shape { name: "palpate.journal.v1.Moment", bytes: size_of::<crate::journal::Moment>(), decode: |bytes| <crate::journal::Moment as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(216) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(217) },
 ] },
 Shape { name: "palpate.journal.v1.FeltTool", bytes: size_of::<crate::journal::FeltTool>(), decode: |bytes| <crate::journal::FeltTool as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(217) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(217) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(217) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(218) },
 ] },
 Shape { name: "palpate.journal.v1.Vector", bytes: size_of::<crate::journal::Vector>(), decode: |bytes| <crate::journal::Vector as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 4) },
@@ -1289,7 +1299,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 ] },
 Shape { name: "palpate.journal.v1.Waiting", bytes: size_of::<crate::journal::Waiting>(), decode: |bytes| <crate::journal::Waiting as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(196) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(197) },
 ] },
 Shape { name: "palpate.journal.v1.Signature", bytes: size_of::<crate::journal::Signature>(), decode: |bytes| <crate::journal::Signature as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1311,17 +1321,17 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(69) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(222) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(225) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(206) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(223) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(226) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(207) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal::TriangleMesh>(), decode: |bytes| <crate::journal::TriangleMesh as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(224) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(223) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(225) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(224) },
 ] },
 Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1367,7 +1377,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(228) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(229) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1383,8 +1393,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(228) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(229) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1395,7 +1405,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1404,20 +1414,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(233) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(235) },
-] },
-#[cfg(feature = "etcd")]
-Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(232) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(234) },
 Field { number: 3, is_list: false, kind: FieldKind::Message(236) },
+] },
+#[cfg(feature = "etcd")]
+Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Message(233) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(235) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(237) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1429,20 +1439,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(239) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(237) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(237) },
-] },
-#[cfg(feature = "etcd")]
-Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
-Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(240) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(238) },
 Field { number: 3, is_list: true, kind: FieldKind::Message(238) },
 ] },
 #[cfg(feature = "etcd")]
+Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(239) },
+] },
+#[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(243) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(244) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(244) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(245) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1457,14 +1467,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(229) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(230) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1473,7 +1483,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1483,7 +1493,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1491,7 +1501,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1502,7 +1512,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1510,7 +1520,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(231) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

@@ -57,6 +57,7 @@ mod tests {
             awake_points: 0,
             late_commands: 0,
             held: false,
+            cuts_exhausted: false,
             recoveries,
             recovered: (recoveries > 0).then(|| Arc::new(Recovered { recovery, tools })),
             tools: Vec::new(),

@@ -6,10 +6,10 @@ use palpate_realtime::event_log::EventLog;
 use palpate_realtime::playback::Playback;
 use palpate_realtime::{RunState, SessionHandle};
 use palpate_session::wire;
-use palpate_tissue::Model;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::{AuditedError, StageTime};
 use palpate_tissue::select::audit::Origin;
+use palpate_tissue::{Model, TieState};
 
 /// Returns the current state of a session as a message.
 pub(super) fn session(handle: &SessionHandle) -> pb::Session {
@@ -57,6 +57,8 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
         severed: count(status.cuts.len()),
         // Counting looks at all springs.
         pieces: if status.cuts.is_empty() { 1 } else { count(status.cuts.pieces(model)) },
+        cuts_exhausted: !status.cuts.has_room(model),
+        ties: status.ties.into_iter().map(laid_tie).collect(),
         awake_points: count(status.awake_points),
         streams: count(handle.streams()),
         scene_name: model.scene.name.clone(),
@@ -74,6 +76,17 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
 
 fn stage_time(StageTime { stage, time_s }: StageTime) -> pb::StageTime {
     pb::StageTime { stage: stage.to_owned(), time_s }
+}
+
+fn laid_tie(state: TieState) -> pb::LaidTie {
+    let TieState { number, tie, tensions_n, length_m, path_m, is_broken, .. } = state;
+    pb::LaidTie {
+        tie: Some(wire::command::tie(u32::try_from(number).unwrap_or(u32::MAX), Some(&tie))),
+        length_m,
+        path_m,
+        tension_n: tensions_n.into_iter().fold(0.0, f64::max),
+        broken: is_broken,
+    }
 }
 
 /// Returns what a session plays back.

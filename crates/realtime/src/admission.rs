@@ -232,6 +232,7 @@ impl Pacer {
             recovery_count: 0,
             recoveries: Vec::new(),
             cuts: session.tissue().cuts(),
+            ties: session.tissue().ties(),
             awake_points: 0,
             path_counts: [0; 3],
             stages: Vec::new(),

@@ -28,6 +28,9 @@ enum HashSource {
     Copy(Arc<Copied>),
 }
 
+/// Number of steps between two lists of threads and clips in the status: where they are is a sum over the points of each bite.
+pub(super) const TIES_EVERY: u64 = 32;
+
 impl SessionTask {
     /// Sends the auditor the mark of a window's beginning or end, without waiting: the channel has room for both.
     pub(super) fn tell_auditor(&mut self) {
@@ -132,7 +135,11 @@ impl SessionTask {
             (None, true) => RunState::Running,
             (None, false) => RunState::Paused,
         };
-        status.step = self.session.step_count();
+        let step = self.session.step_count();
+        if !self.running || step / TIES_EVERY != status.step / TIES_EVERY {
+            status.ties = self.session.tissue().ties();
+        }
+        status.step = step;
         status.model.clone_from(self.session.model());
         status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;

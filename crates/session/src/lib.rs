@@ -137,6 +137,8 @@ pub struct Sample {
     pub late_commands: u64,
     /// Whether the session is stopped by the guard, by a fault or by [`Session::hold`]: it is not stepped any more.
     pub held: bool,
+    /// Whether blades only push, because a solid has no room for further cuts ([`Session::cuts_exhausted`]).
+    pub cuts_exhausted: bool,
     /// Number of recoveries so far: returns of the tissue to an earlier state ([`recovery`]).
     pub recoveries: u64,
     /// The newest recovery, with the tools that had acted; `None` before the first. It stays until the next one.
@@ -267,6 +269,12 @@ impl Session {
     #[allow(clippy::cast_precision_loss)]
     pub fn time_s(&self) -> f64 {
         self.step_count() as f64 / self.model().scene.stepping.rate_hz
+    }
+
+    /// Returns whether a solid has no spare places left for the corners that one more severed face could double, so that blades only
+    /// push. Another tissue always has room.
+    pub fn cuts_exhausted(&self) -> bool {
+        !self.tissue.cuts().has_room(self.model())
     }
 
     /// Returns why the session is stopped for good; `None` if it is not. The reason comes from a blow-up after which
@@ -697,6 +705,7 @@ impl Session {
             awake_points: self.tissue.awake_points(),
             late_commands: self.late_commands,
             held: self.hold_reason.is_some(),
+            cuts_exhausted: self.cuts_exhausted(),
             recoveries: self.recoveries.count(),
             recovered: self.recoveries.newest(),
             tools,

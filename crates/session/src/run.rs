@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::Session;
 use super::audit::{Twin, Windows};
 use super::simulation::{Simulation, SimulationFailure};
-use palpate_haptics::{JawTorqueMonitor, Tip};
+use palpate_haptics::{JawTorqueMonitor, Tip, TipShape};
 use palpate_refusal::legible;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
@@ -178,8 +178,15 @@ pub fn run_with(
         )
     });
     let crushed = jaws.warning(model.scene.stepping.rate_hz);
-    let warnings =
-        far_warning(largest_displacement_m, model.shape()).into_iter().chain(on_fixed).chain(crushed).collect();
+    let exhausted = (session.cuts_exhausted() && has_blade(script)).then(|| {
+        "blades only push in the end: the solid has no spare places left for the corners that another cut would double".to_owned()
+    });
+    let warnings = far_warning(largest_displacement_m, model.shape())
+        .into_iter()
+        .chain(on_fixed)
+        .chain(crushed)
+        .chain(exhausted)
+        .collect();
     let summary = Summary {
         audited_error,
         mesh_error_estimate: MeshErrorEstimate::of(model, disc(model, script)).map(|error| error.relative),
@@ -291,6 +298,13 @@ impl WatchedJaws {
             legible(*limit_n_m)
         ))
     }
+}
+
+/// Returns whether a script has a blade.
+fn has_blade(script: &Script) -> bool {
+    let of_instruments = script.instruments.iter().flat_map(|profile| &profile.instrument.tips).map(|tip| &tip.tip);
+    let mut tips = script.poses.iter().map(|profile| &profile.tip).chain(of_instruments);
+    tips.any(|tip| tip.shape == TipShape::Blade)
 }
 
 /// Returns the disc of the first tip of a script, where it is first; without a tip that of a fingertip in the middle.

@@ -50,6 +50,8 @@ const TOLERANCE: f64 = 1e-12;
 pub struct TieState {
     /// Its number.
     pub number: usize,
+    /// The tie as it was laid or last changed.
+    pub tie: Tie,
     /// Tension of each part between two bites, N, as a mean over the last step: of a clip the force between its bites.
     pub tensions_n: Vec<f64>,
     /// The largest tension of a part in any step so far, N.
@@ -239,6 +241,7 @@ impl Ties {
             let places_m = laid.places_m(&displacement_m);
             TieState {
                 number: laid.number,
+                tie: laid.tie.clone(),
                 tensions_n: laid.tensions_n.clone(),
                 peak_n: laid.peak_n,
                 length_m: laid.lengths_m.iter().sum::<f64>() + laid.apart_m.length(),
