@@ -384,7 +384,7 @@ class RemoteSession:
     def server(self) -> str:
         """URL of the server that last had the session."""
     def status(self) -> dict[str, Any]:
-        """Returns the state of the session: state, step, points, held tools, and more."""
+        """Returns the state of the session: state, step, points, held tools, what is cut, threads and clips, and more."""
     def start(self, *, until_step: Optional[int] = None) -> int:
         """Starts the session, to run until step `until_step` if given. Returns the next step."""
     def pause(self) -> None:
@@ -462,6 +462,31 @@ class RemoteSession:
         """Pushes at a point or a place; at a distance r from there with force_n * exp(-falloff_per_m * r + falloff_offset)."""
     def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None:
         """Holds a point, and moves it to this displacement from its place at rest."""
+    def thread(
+        self,
+        tool: int,
+        number: int,
+        bites_m: Sequence[Vector],
+        length_m: float,
+        *,
+        radius_m: float = 0.001,
+        friction: float = 0.0,
+        strength_n: Optional[float] = None,
+    ) -> None:
+        """Lays thread `number`, as `Session.thread` does; acquires the tool first if needed. `status()["ties"]` has the threads and
+        clips."""
+    def clip(
+        self,
+        tool: int,
+        number: int,
+        bites_m: Sequence[Vector],
+        *,
+        radius_m: float = 0.001,
+        strength_n: Optional[float] = None,
+    ) -> None:
+        """Closes clip `number` on two places, as `Session.clip` does; acquires the tool first if needed."""
+    def untie(self, tool: int, number: int) -> None:
+        """Cuts a thread or clip, and takes it out; acquires the tool first if needed."""
     def release(self, tool: int) -> None:
         """Ends what a tool does, and releases it."""
     def play(self, script: Union[Script, Source], *, scene: Optional[Union[Scene, Source]] = None) -> Run:

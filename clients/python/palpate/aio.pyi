@@ -1,4 +1,4 @@
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from os import PathLike
 from typing import Any, Literal, Optional, Union
 
@@ -62,6 +62,21 @@ class RemoteSession:
         falloff_offset: float = 0.0,
     ) -> None: ...
     async def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None: ...
+    async def thread(
+        self,
+        tool: int,
+        number: int,
+        bites_m: Sequence[Vector],
+        length_m: float,
+        *,
+        radius_m: float = 0.001,
+        friction: float = 0.0,
+        strength_n: Optional[float] = None,
+    ) -> None: ...
+    async def clip(
+        self, tool: int, number: int, bites_m: Sequence[Vector], *, radius_m: float = 0.001, strength_n: Optional[float] = None
+    ) -> None: ...
+    async def untie(self, tool: int, number: int) -> None: ...
     async def release(self, tool: int) -> None: ...
     async def play(self, script: Union[Script, Source], *, scene: Optional[Union[Scene, Source]] = None) -> Run: ...
     async def __aenter__(self) -> RemoteSession: ...

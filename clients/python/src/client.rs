@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::bridge::{self, Copies, Options, Target};
-use palpate_client::{Channel, Credentials, Followed, Token, snapshot};
+use palpate_client::{Channel, Credentials, Followed, HeldTools, Token, snapshot};
 use palpate_proto::{pb, touch};
 use palpate_refusal::{Reason, Refusal};
 use palpate_session::journal;
@@ -23,7 +23,6 @@ use crate::arrays::vector;
 use crate::device::Given;
 use crate::error::{of_client, of_status, refused, wrong};
 use crate::hand::Hand;
-use crate::held::Held;
 use crate::instrument::Instrument;
 use crate::load::load;
 use crate::play::play;
@@ -33,6 +32,9 @@ use crate::streams::{self, Following, FrameStream, Samples};
 use crate::tip::Tip;
 use crate::told::{Bytes, Status, SurfaceMesh, Touched};
 use crate::waiting::{answer, answer_in_order};
+
+/// The name of a tool's holder that others see.
+pub(crate) const HOLDER: &str = "python";
 
 /// The result of a call without a result: `None`.
 const NOTHING: Option<bool> = None;
@@ -60,7 +62,7 @@ impl Server {
     /// Finds the session with this ID, on any server of the fleet.
     async fn found(self, id: String, scene: Option<Arc<scene::Scene>>) -> PyResult<RemoteSession> {
         let found = Followed::find(self.server, self.channel, id).await.map_err(of_client)?;
-        Ok(RemoteSession { session: found.0.into(), held: Arc::default(), scene, awaited: self.awaited })
+        Ok(RemoteSession::of(found.0, scene, self.awaited))
     }
 }
 
@@ -144,8 +146,8 @@ impl Server {
             match &made.ownership {
                 Some(_) => server.found(made.session_id, own).await,
                 None => {
-                    let session = Followed::new(server.server, server.channel, made.session_id).into();
-                    Ok(RemoteSession { session, held: Arc::default(), scene: own, awaited })
+                    let session = Followed::new(server.server, server.channel, made.session_id);
+                    Ok(RemoteSession::of(session, own, awaited))
                 }
             }
         })
@@ -191,7 +193,7 @@ fn numbers(DVec3 { x, y, z }: DVec3) -> pb::Vector3 {
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct RemoteSession {
     pub(crate) session: Arc<Followed>,
-    pub(crate) held: Arc<Held>,
+    pub(crate) held: Arc<HeldTools>,
     /// The scene from which the caller created it.
     pub(crate) scene: Option<Arc<scene::Scene>>,
     pub(crate) awaited: bool,
@@ -210,14 +212,26 @@ macro_rules! called {
 }
 pub(crate) use called;
 
+/// Returns bites at some places, all with the same radius.
+fn bites(places_m: &[Bound<'_, PyAny>], radius_m: f64) -> PyResult<Vec<pb::Bite>> {
+    let bite = |place_m| Ok(pb::Bite { place_m: Some(numbers(vector("bites_m", place_m)?)), radius_m });
+    places_m.iter().map(bite).collect()
+}
+
 impl RemoteSession {
+    fn of(session: Followed, scene: Option<Arc<scene::Scene>>, awaited: bool) -> Self {
+        let session = Arc::new(session);
+        let held = Arc::new(HeldTools::new(session.clone(), HOLDER));
+        RemoteSession { session, held, scene, awaited }
+    }
+
     /// Returns the session, to be moved into a future, and its ID.
     fn own(&self) -> (Arc<Followed>, String) {
         (self.session.clone(), self.session.session_id().to_owned())
     }
 
     fn tell<'py>(&self, py: Python<'py>, tool: u32, action: Action) -> PyResult<Bound<'py, PyAny>> {
-        let told = self.held.clone().tell(self.session.clone(), tool, action);
+        let told = self.held.clone().command(tool, action);
         answer(py, self.awaited, async move { told.await.map(|()| NOTHING).map_err(of_client) })
     }
 }
@@ -236,7 +250,7 @@ impl RemoteSession {
         self.session.server().url().to_owned()
     }
 
-    /// Returns the state of the session: state, step, points, held tools, and more.
+    /// Returns the state of the session: state, step, points, held tools, what is cut, threads and clips, and more.
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -526,9 +540,51 @@ impl RemoteSession {
         self.tell(py, tool, Action::Position(pb::Position { point, vertex, target }))
     }
 
+    /// Lays thread `number`, as `Session.thread` does; acquires the tool first if needed. `status()["ties"]` has the threads and clips.
+    #[pyo3(signature = (tool, number, bites_m, length_m, *, radius_m=0.001, friction=0.0, strength_n=None))]
+    #[allow(clippy::too_many_arguments)]
+    fn thread<'py>(
+        &self,
+        py: Python<'py>,
+        tool: u32,
+        number: u32,
+        bites_m: Vec<Bound<'py, PyAny>>,
+        length_m: f64,
+        radius_m: f64,
+        friction: f64,
+        strength_n: Option<f64>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let thread = pb::Thread { bites: bites(&bites_m, radius_m)?, length_m, friction, strength_n };
+        let laid = self.held.clone().thread(tool, number, thread);
+        answer(py, self.awaited, async move { laid.await.map(|()| NOTHING).map_err(of_client) })
+    }
+
+    /// Closes clip `number` on two places, as `Session.clip` does; acquires the tool first if needed.
+    #[pyo3(signature = (tool, number, bites_m, *, radius_m=0.001, strength_n=None))]
+    #[allow(clippy::too_many_arguments)]
+    fn clip<'py>(
+        &self,
+        py: Python<'py>,
+        tool: u32,
+        number: u32,
+        bites_m: Vec<Bound<'py, PyAny>>,
+        radius_m: f64,
+        strength_n: Option<f64>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let clip = pb::Clip { bites: bites(&bites_m, radius_m)?, strength_n };
+        let laid = self.held.clone().clip(tool, number, clip);
+        answer(py, self.awaited, async move { laid.await.map(|()| NOTHING).map_err(of_client) })
+    }
+
+    /// Cuts a thread or clip, and takes it out; acquires the tool first if needed.
+    fn untie<'py>(&self, py: Python<'py>, tool: u32, number: u32) -> PyResult<Bound<'py, PyAny>> {
+        let cut = self.held.clone().untie(tool, number);
+        answer(py, self.awaited, async move { cut.await.map(|()| NOTHING).map_err(of_client) })
+    }
+
     /// Ends what a tool does, and releases it.
     fn release<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Bound<'py, PyAny>> {
-        let released = self.held.clone().release(self.session.clone(), tool);
+        let released = self.held.clone().release(tool);
         answer(py, self.awaited, async move { released.await.map(|()| NOTHING).map_err(of_client) })
     }
 

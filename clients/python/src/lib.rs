@@ -16,7 +16,6 @@ mod device;
 mod ending;
 mod error;
 mod hand;
-mod held;
 mod instrument;
 mod journal;
 mod load;

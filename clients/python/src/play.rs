@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use palpate_client::Followed;
+use palpate_client::held::{acquire, send};
 use palpate_proto::pb;
 use palpate_session::wire;
 use palpate_tissue::scene;
@@ -15,9 +16,8 @@ use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pyo3::prelude::*;
 
-use crate::client::called;
+use crate::client::{HOLDER, called};
 use crate::error::{failed, of_client, of_status, refused, wrong};
-use crate::held::{acquire, send};
 use crate::run::RunRecord;
 use crate::scene::Script;
 
@@ -48,7 +48,7 @@ impl PlaySource {
 
     async fn take_tools(&mut self) -> PyResult<()> {
         for tool in 0..u32::try_from(self.script.tools()).unwrap_or(u32::MAX) {
-            let lease = acquire(&self.session, tool).await.map_err(of_client)?;
+            let lease = acquire(&self.session, tool, HOLDER).await.map_err(of_client)?;
             self.leases.insert(tool, lease);
         }
         Ok(())

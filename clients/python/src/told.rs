@@ -1,5 +1,7 @@
 //! Messages of a server about a session, converted for Python.
 
+use std::collections::BTreeMap;
+
 use palpate_client::bridge::BridgeReport;
 use palpate_haptics::{LimitCause, RenderingState};
 use palpate_proto::geometry::from_vector;
@@ -27,12 +29,34 @@ pub(crate) struct Status {
     late_commands: u64,
     recoveries: u64,
     awake_points: u32,
+    topology_version: u32,
+    severed: u32,
+    pieces: u32,
+    cuts_exhausted: bool,
+    ties: BTreeMap<u32, TieStatus>,
     resting: bool,
     hold_reason: String,
     held_tools: Vec<(u32, String)>,
     middle_m: (f64, f64, f64),
     top_m: (f64, f64, f64),
     warnings: Vec<String>,
+}
+
+/// A thread or clip of a session.
+#[derive(IntoPyObject)]
+struct TieStatus {
+    tension_n: f64,
+    length_m: f64,
+    path_m: f64,
+    is_broken: bool,
+}
+
+impl TieStatus {
+    /// Returns it with its number.
+    fn of(laid: pb::LaidTie) -> (u32, Self) {
+        let pb::LaidTie { tie, length_m, path_m, tension_n, broken } = laid;
+        (tie.map_or(0, |tie| tie.number), TieStatus { tension_n, length_m, path_m, is_broken: broken })
+    }
 }
 
 impl Status {
@@ -61,6 +85,11 @@ impl Status {
             late_commands: session.late_commands,
             recoveries: session.recovery_count,
             awake_points: session.awake_points,
+            topology_version: session.topology_version,
+            severed: session.severed,
+            pieces: session.pieces,
+            cuts_exhausted: session.cuts_exhausted,
+            ties: session.ties.into_iter().map(TieStatus::of).collect(),
             resting: session.resting,
             hold_reason: session.hold_reason,
             held_tools: session.held_tools.into_iter().map(|held| (held.tool, held.holder)).collect(),

@@ -179,6 +179,26 @@ class Clients(Served, unittest.TestCase):
             touched = felt(lambda: session.touch(palpate.press(depth_m=0.003, seconds=2.0)))
             np.testing.assert_allclose(touched.place_m[-1], np.add(status["top_m"], (0.0, 0.0, 0.005)), atol=1e-4)
 
+    def test_a_thread_on_a_server_stays_when_its_tool_is_released_and_is_taken_off(self):
+        with palpate.connect(self.url).create_session("liver") as session:
+            bites_m = [(0.03, 0.03, 0.0), (0.035, 0.034, 0.0), (0.04, 0.03, 0.0)]
+            session.thread(3, 7, bites_m, 0.01, friction=0.1)
+            session.clip(3, 2, [(0.03, 0.05, 0.0), (0.034, 0.05, 0.0)])
+
+            def until(is_so):
+                while not is_so(session.status()["ties"]):
+                    pass
+
+            until(lambda ties: sorted(ties) == [2, 7] and ties[7]["path_m"] < 0.0101 and ties[7]["tension_n"] > 1e-3)
+            session.release(3)
+            status = session.status()
+            self.assertEqual((status["pieces"], status["severed"], status["cuts_exhausted"]), (1, 0, False))
+            session.untie(4, 7)
+            until(lambda ties: sorted(ties) == [2])
+            with self.assertRaises(palpate.Refused) as refused:
+                session.thread(3, 0, bites_m[:1], 0.01)
+            self.assertEqual(refused.exception.field, "tie.bites")
+
     def test_a_tool_that_is_held_is_refused_at_once(self):
         server = palpate.connect(self.url)
         with server.create_session("paper") as session:

@@ -80,6 +80,11 @@ class Help(unittest.TestCase):
                 "(self, /, tool, number, bites_m, length_m, *, radius_m=0.001, friction=0.0, strength_n=None)",
             ),
             (palpate.Session.clip, "(self, /, tool, number, bites_m, *, radius_m=0.001, strength_n=None)"),
+            (
+                palpate.RemoteSession.thread,
+                "(self, /, tool, number, bites_m, length_m, *, radius_m=0.001, friction=0.0, strength_n=None)",
+            ),
+            (palpate.RemoteSession.untie, "(self, /, tool, number)"),
             (palpate.Client.load, "(self, /, plan, *, report=None)"),
         ]:
             self.assertEqual(str(inspect.signature(there)), arguments)
