@@ -30,8 +30,9 @@ namespace Palpate
     /// <summary>Axes and unit of positions, normals and forces; see palpate_axes.</summary>
     public enum Axes : uint { Own = 0, Unity = 1, Unreal = 2 }
 
-    /// <summary>How a tip presses: with an even pressure, or rigid, which solids alone take; see palpate_tip_shape.</summary>
-    public enum TipShape : uint { Disc = 0, RigidDisc = 1, Sphere = 2 }
+    /// <summary>How a tip presses: with an even pressure, or rigid, which solids alone take; or a blade, which cuts; see
+    /// palpate_tip_shape.</summary>
+    public enum TipShape : uint { Disc = 0, RigidDisc = 1, Sphere = 2, Blade = 3 }
 
     /// <summary>Whether forces are rendered; see palpate_state.</summary>
     public enum State : uint { Waiting = 0, Disabled = 1, Enabled = 2, Paused = 3, Fault = 4 }
@@ -158,6 +159,53 @@ namespace Palpate
         public Code Result { get { return (Code)result; } }
     }
 
+    /// <summary>State of a session; see palpate_session_status.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Status
+    {
+        public ulong Step;
+        public double Time;
+        public uint TopologyVersion, Severed, Pieces;
+        uint exhausted;
+        /// <summary>Whether a solid has no room for further cuts, so that blades only push.</summary>
+        public bool CutsExhausted { get { return exhausted != 0; } }
+    }
+
+    /// <summary>A thread or clip; see palpate_tie.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Tie
+    {
+        public uint Number;
+        uint clip;
+        public double Length, Path, Tension;
+        uint broken, unused;
+        public bool IsClip { get { return clip != 0; } }
+        public bool IsBroken { get { return broken != 0; } }
+    }
+
+    /// <summary>Options of a thread or clip; see palpate_tie_options. Session sets the bites and the length.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct TieOptions
+    {
+        UIntPtr size;
+        public uint Tool;
+        public Axes Axes;
+        internal IntPtr Bites;
+        internal UIntPtr BiteCount;
+        public double BiteRadius;
+        internal double Length;
+        public double Friction, Strength;
+        public static TieOptions Default
+        {
+            get
+            {
+                TieOptions options;
+                Native.Check(Native.palpate_tie_options_init(out options, (UIntPtr)Marshal.SizeOf(typeof(TieOptions))));
+                return options;
+            }
+        }
+    }
+
     /// <summary>A change of the tissue. Values that are NaN are left unchanged.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Change
@@ -205,6 +253,10 @@ namespace Palpate
         /// <summary>Largest torque of the device, N·m; 0: it renders none.</summary>
         public double MaxTorque;
         internal IntPtr Hand;
+        /// <summary>The edge of a blade from its tip to its heel; see palpate_touch_options.</summary>
+        public Vector Edge;
+        /// <summary>Time of contact after which the tip severs by heat, s; 0: it does not burn.</summary>
+        public double Burn;
         public bool HasPort { get { return hasPort != 0; } set { hasPort = value ? 1u : 0u; } }
         /// <summary>How many tools a loop with these options moves: one for each tip of an instrument.</summary>
         public uint ToolCount
@@ -253,6 +305,7 @@ namespace Palpate
     [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Write(IntPtr user, ref Vector force);
     [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int ReadInstrument(IntPtr user, ref InstrumentReading reading);
     [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int WriteInstrument(IntPtr user, ref Vector force, ref Vector torque);
+    delegate Code LayTie(IntPtr session, uint number, ref TieOptions options);
     delegate Code WriteText(byte[] text, UIntPtr capacity, out UIntPtr needed);
 
     static class Native
@@ -277,6 +330,13 @@ namespace Palpate
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_extent(IntPtr session, out Extent extent);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_change(IntPtr session, ref Change change);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_delete(IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_status_of(IntPtr session, out Status status);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_tie_options_init(out TieOptions options, UIntPtr size);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_thread(IntPtr session, uint number, ref TieOptions options);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_clip(IntPtr session, uint number, ref TieOptions options);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_untie(IntPtr session, uint tool, uint number);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_release(IntPtr session, uint tool);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_ties(IntPtr session, [Out] Tie[] ties, UIntPtr capacity, out UIntPtr count);
         [DllImport(Library, CallingConvention = C)] internal static extern void palpate_session_free(IntPtr session);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_begin(IntPtr session, ref TouchOptions options, out IntPtr touch);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_begin_offline(ref TouchOptions options, Vector middle, out IntPtr touch);
@@ -478,6 +538,55 @@ namespace Palpate
 
         /// <summary>Changes the tissue. Waits for the server.</summary>
         public void Apply(Change change) { Native.Check(Native.palpate_session_change(Pointer, ref change)); }
+
+        /// <summary>The state of the session. Waits for the server.</summary>
+        public Status Status
+        {
+            get { Status status; Native.Check(Native.palpate_session_status_of(Pointer, out status)); return status; }
+        }
+
+        /// <summary>Lays a thread through bites, or changes one that has these bites; see palpate_session_thread. Waits for the
+        /// server.</summary>
+        public void Thread(uint number, Vector[] bites, double length, TieOptions options)
+        {
+            options.Length = length;
+            Lay(Native.palpate_session_thread, number, bites, options);
+        }
+
+        /// <summary>Closes a clip on two bites; see palpate_session_clip. Waits for the server.</summary>
+        public void Clip(uint number, Vector[] bites, TieOptions options) { Lay(Native.palpate_session_clip, number, bites, options); }
+
+        void Lay(LayTie lay, uint number, Vector[] bites, TieOptions options)
+        {
+            var pinned = GCHandle.Alloc(bites, GCHandleType.Pinned);
+            try
+            {
+                options.Bites = pinned.AddrOfPinnedObject();
+                options.BiteCount = (UIntPtr)bites.Length;
+                Native.Check(lay(Pointer, number, ref options));
+            }
+            finally { pinned.Free(); }
+        }
+
+        /// <summary>Cuts a thread or clip by a tool, and takes it out. Waits for the server.</summary>
+        public void Untie(uint tool, uint number) { Native.Check(Native.palpate_session_untie(Pointer, tool, number)); }
+
+        /// <summary>Releases a tool that has laid threads or clips, which stay. Waits for the server.</summary>
+        public void Release(uint tool) { Native.Check(Native.palpate_session_release(Pointer, tool)); }
+
+        /// <summary>The threads and clips of the session, of all its users. Waits for the server.</summary>
+        public Tie[] Ties
+        {
+            get
+            {
+                // A server has at most 64.
+                var ties = new Tie[64];
+                UIntPtr count;
+                Native.Check(Native.palpate_session_ties(Pointer, ties, (UIntPtr)ties.Length, out count));
+                Array.Resize(ref ties, (int)count);
+                return ties;
+            }
+        }
 
         /// <summary>Deletes the session on the server, for all users. Waits for the server.</summary>
         public void Delete() { Native.Check(Native.palpate_session_delete(Pointer)); }

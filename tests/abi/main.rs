@@ -117,6 +117,15 @@ fn assert_both_hands_felt(output: &Output, min_torque_n_m: f64) {
     }
 }
 
+/// Checks the output of an example that cuts liver along 30 mm, twelve springs of 2.5 mm, and sews it by a thread of 20 mm.
+fn assert_sewn(output: &Output) {
+    let told = told(output);
+    assert!(told["severed"].as_u64().unwrap() >= 24 && told["pieces"].as_u64() == Some(1), "{told}");
+    assert!(told["version"].as_u64().unwrap() > 1, "{told}");
+    let (thread_m, tension_n) = (told["thread_m"].as_f64().unwrap(), told["tension_n"].as_f64().unwrap());
+    assert!((0.019..0.021).contains(&thread_m) && tension_n > 1e-3, "{told}");
+}
+
 const RUN: [&str; 2] = ["liver", "2"];
 
 /// The examples with two hands end when both have felt the tissue.
@@ -139,6 +148,7 @@ async fn examples_in_c_press_look_and_connect_a_device() {
     assert!(["real time", "refused"].contains(&told["priority"].as_str().unwrap()), "{told}");
     let hands = compiled("clients/c/examples/hands.c", &[]);
     assert_both_hands_felt(&done(ours(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 1e-4);
+    assert_sewn(&done(ours(&compiled("clients/c/examples/cut.c", &[])).arg(&server.url).arg("liver")));
     // Wrong names end with a message and a status.
     for (url, scene) in [("http://127.0.0.1:1", "liver"), (server.url.as_str(), "nowhere")] {
         let refused = ours(&touch).args([url, scene, "1"]).output().unwrap();
@@ -182,6 +192,7 @@ async fn examples_in_cpp_press_look_and_show() {
     // In a port only the turn about the shaft is felt as a torque.
     let hands = compiled("clients/cpp/examples/hands.cpp", &[]);
     assert_both_hands_felt(&done(ours(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 0.0);
+    assert_sewn(&done(ours(&compiled("clients/cpp/examples/cut.cpp", &[])).arg(&server.url).arg("liver")));
     // The others by the CMake package, where there is CMake.
     let built = folder().join("cmake");
     let program = |name: &str| built.join(name);
@@ -232,6 +243,7 @@ async fn examples_in_cs_press_look_and_show() {
     assert_pressed(&run(&compiled_cs("clients/csharp/examples/FrontEnd.cs")), false);
     let hands = compiled_cs("clients/csharp/examples/Hands.cs");
     assert_both_hands_felt(&done(mono(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 1e-4);
+    assert_sewn(&done(mono(&compiled_cs("clients/csharp/examples/Cut.cs")).arg(&server.url).arg("liver")));
     done(mono(&compiled_cs("clients/csharp/tests/Errors.cs")).arg(&server.url));
 }
 

@@ -142,9 +142,13 @@ typedef enum palpate_tip_shape {
    */
   PALPATE_TIP_RIGID_DISC = 1,
   /**
-   * A rigid sphere, whose middle is at the position.
+   * A rigid sphere, whose middle is at the position. Like the rigid disc it touches solids alone.
    */
   PALPATE_TIP_SPHERE = 2,
+  /**
+   * A blade, which severs what its `edge` crosses.
+   */
+  PALPATE_TIP_BLADE = 3,
 } palpate_tip_shape;
 
 /**
@@ -347,7 +351,8 @@ typedef struct palpate_touch_options {
    */
   uint32_t prediction;
   /**
-   * How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Others touch solids alone, and do not hold.
+   * How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Only that one holds. With `PALPATE_TIP_BLADE` jaws are
+   * scissors, and a shaft without jaws begins behind the `edge`.
    */
   uint32_t tip_shape;
   /**
@@ -384,6 +389,17 @@ typedef struct palpate_touch_options {
    * is the only one.
    */
   const struct palpate_hand *hand;
+  /**
+   * With `PALPATE_TIP_BLADE`: the edge of the blade from its tip, at the tool's position, to its heel, as a vector of the tissue's
+   * frame, in the axes and units of the options; of an instrument with a shaft and no jaws, of the instrument's frame, which points
+   * along Palpate's x. Default 0: none.
+   */
+  struct palpate_vector edge;
+  /**
+   * Cautery: the time of contact after which the tissue under the tip is severed, s, up to 3600; 0 (default): it does not burn. For
+   * `PALPATE_TIP_DISC`, on sheets and surfaces.
+   */
+  double burn_s;
 } palpate_touch_options;
 
 /**
@@ -679,6 +695,36 @@ typedef struct palpate_extent {
 } palpate_extent;
 
 /**
+ * The state of a session, from `palpate_session_status_of`.
+ */
+typedef struct palpate_session_status {
+  /**
+   * Number of steps done.
+   */
+  uint64_t step;
+  /**
+   * Simulated time, s.
+   */
+  double time_s;
+  /**
+   * The version of what joins the points of the tissue; 0 if nothing was severed.
+   */
+  uint32_t topology_version;
+  /**
+   * Number of severed springs, or of severed faces between the cells of a solid.
+   */
+  uint32_t severed;
+  /**
+   * Number of parts of the tissue; 1 if it is whole.
+   */
+  uint32_t pieces;
+  /**
+   * 1 if a solid has no room for further cuts, so that blades only push; else 0.
+   */
+  uint32_t cuts_exhausted;
+} palpate_session_status;
+
+/**
  * A change of the tissue's coefficients. A value that is NaN leaves the coefficient as it is.
  */
 typedef struct palpate_change {
@@ -773,6 +819,80 @@ typedef struct palpate_dirty {
    */
   double simulation_time_s;
 } palpate_dirty;
+
+/**
+ * Options of `palpate_session_thread` and `palpate_session_clip`.
+ */
+typedef struct palpate_tie_options {
+  /**
+   * Size of this structure, set by `palpate_tie_options_init`.
+   */
+  size_t size;
+  /**
+   * The tool that lays it; default 0. The session's handle acquires it, and holds it until `palpate_session_release` or
+   * `palpate_session_free`: choose one that none of your loops moves.
+   */
+  uint32_t tool;
+  /**
+   * Axes of the bites, one of `palpate_axes`; default `PALPATE_AXES_OWN`.
+   */
+  uint32_t axes;
+  /**
+   * The places at which it holds the tissue, in its frame, in their order: 2 to 16 for a thread, 2 for a clip. Each is the place of the
+   * surface at rest that is nearest. They are copied.
+   */
+  const struct palpate_vector *bites;
+  /**
+   * Number of bites.
+   */
+  size_t bite_count;
+  /**
+   * Radius of the disc over which the force at a bite is spread, m; default 0.001.
+   */
+  double bite_radius_m;
+  /**
+   * Of a thread: its length from the first bite to the last, m. It is drawn in at its last bite, by at most 0.1 m/s.
+   */
+  double length_m;
+  /**
+   * Of a thread: coefficient of friction with the tissue, 0 (default) to 10.
+   */
+  double friction;
+  /**
+   * Tension at which a thread breaks, or force at which a clip opens, N; 0 (default): never.
+   */
+  double strength_n;
+} palpate_tie_options;
+
+/**
+ * A thread or clip of a session.
+ */
+typedef struct palpate_tie {
+  /**
+   * Its number.
+   */
+  uint32_t number;
+  /**
+   * 1 for a clip, 0 for a thread.
+   */
+  uint32_t is_clip;
+  /**
+   * Present length of the thread, m; of a clip how far it is from being closed.
+   */
+  double length_m;
+  /**
+   * Sum of the distances between successive bites, m.
+   */
+  double path_m;
+  /**
+   * The largest tension between two bites in the last step, N.
+   */
+  double tension_n;
+  /**
+   * 1 if it has broken and no longer holds anything, else 0.
+   */
+  uint32_t is_broken;
+} palpate_tie;
 
 /**
  * What a tick felt: the force, and the state of the rendering.
@@ -1039,6 +1159,12 @@ enum palpate_result palpate_session_id(const struct palpate_session *session,
 enum palpate_result palpate_session_extent(const struct palpate_session *session, struct palpate_extent *extent);
 
 /**
+ * Writes the present state of the session. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_status_of(const struct palpate_session *session,
+                                              struct palpate_session_status *status);
+
+/**
  * Initializes a change so that it changes nothing. Any thread.
  */
 enum palpate_result palpate_change_init(struct palpate_change *change);
@@ -1105,6 +1231,50 @@ enum palpate_result palpate_surface_read(const struct palpate_surface *surface,
  * Frees a handle. Null is allowed. Any thread, once, when no other thread is in a function of this handle.
  */
 void palpate_surface_free(struct palpate_surface *surface);
+
+/**
+ * Sets all options to their defaults; `size` is `sizeof *options`. Any thread.
+ */
+enum palpate_result palpate_tie_options_init(struct palpate_tie_options *options, size_t size);
+
+/**
+ * Lays thread `number`, a number below the server's limit of 64 that threads and clips of the session share; from the next step on. If a
+ * thread with this number has these bites already, only its length, friction and strength change; else it is laid anew. It stays until it
+ * is cut. Returns `PALPATE_REFUSED` also if another caller or a loop holds the tool. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_thread(const struct palpate_session *session,
+                                           uint32_t number,
+                                           const struct palpate_tie_options *options);
+
+/**
+ * Closes clip `number` on two bites, and holds them together; otherwise as `palpate_session_thread`. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_clip(const struct palpate_session *session,
+                                         uint32_t number,
+                                         const struct palpate_tie_options *options);
+
+/**
+ * Cuts thread or clip `number` by a tool, and takes it out; without effect if there is none. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_untie(const struct palpate_session *session,
+                                          uint32_t tool,
+                                          uint32_t number);
+
+/**
+ * Releases a tool that the session's handle holds; threads and clips stay. Without effect if it does not hold it. Any thread; waits for the
+ * server.
+ */
+enum palpate_result palpate_session_release(const struct palpate_session *session,
+                                            uint32_t tool);
+
+/**
+ * Writes the threads and clips of the session, of all its users, by ascending number, and into `count` how many there are. `ties` may be
+ * null. Returns `PALPATE_BUFFER` if `capacity` of them are too few. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_ties(const struct palpate_session *session,
+                                         struct palpate_tie *ties,
+                                         size_t capacity,
+                                         size_t *count);
 
 /**
  * Acquires a tool of a session for a loop of your own, such as that of an engine's haptic thread, and waits until it

@@ -17,6 +17,7 @@ mod options;
 mod os;
 mod server;
 mod surface;
+mod tie;
 mod touch;
 
 use std::ffi::{CStr, c_char};
@@ -29,6 +30,7 @@ pub use instrument::*;
 pub use options::*;
 pub use server::*;
 pub use surface::*;
+pub use tie::*;
 pub use touch::*;
 
 /// The version of the interface. A change that breaks programs increases it, and the number in the library's file

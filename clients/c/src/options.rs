@@ -3,8 +3,9 @@
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
+use glam::DVec3;
 use palpate_client::bridge::{Copies, HandSlot, PositionOrigin, Warn};
-use palpate_haptics::instrument::MAX_TIPS;
+use palpate_haptics::instrument::{InstrumentPart, MAX_TIPS};
 use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use palpate_haptics::{Device, Instrument, Port, Tip, TipShape};
 use palpate_proto::{pb, touch};
@@ -99,7 +100,8 @@ pub struct palpate_touch_options {
     /// correct the copy. 0 (default): none; 1: meshes, whose rims, folds and lumps no local model can predict; 2:
     /// all. A thread of the library steps the copy; a tick uses its result for the last tick, and waits for nothing.
     pub prediction: u32,
-    /// How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Others touch solids alone, and do not hold.
+    /// How the tip presses, one of `palpate_tip_shape`; default `PALPATE_TIP_DISC`. Only that one holds. With `PALPATE_TIP_BLADE` jaws are
+    /// scissors, and a shaft without jaws begins behind the `edge`.
     pub tip_shape: u32,
     /// Length of the jaws of an instrument, which end at the device's position, m, at most 0.5; 0 (default): none. With jaws
     /// or a shaft the device leads an instrument, by its position, orientation and jaws: a row of tips for each jaw and for
@@ -121,6 +123,13 @@ pub struct palpate_touch_options {
     /// One of the two hands of `palpate_two_hands`, if your program moves two tools or instruments; null (default): this
     /// is the only one.
     pub hand: *const palpate_hand,
+    /// With `PALPATE_TIP_BLADE`: the edge of the blade from its tip, at the tool's position, to its heel, as a vector of the tissue's
+    /// frame, in the axes and units of the options; of an instrument with a shaft and no jaws, of the instrument's frame, which points
+    /// along Palpate's x. Default 0: none.
+    pub edge: palpate_vector,
+    /// Cautery: the time of contact after which the tissue under the tip is severed, s, up to 3600; 0 (default): it does not burn. For
+    /// `PALPATE_TIP_DISC`, on sheets and surfaces.
+    pub burn_s: f64,
 }
 
 /// Options of `palpate_surface_open`.
@@ -264,6 +273,8 @@ unsafe impl Versioned for palpate_touch_options {
             handle_m: DEFAULT_HANDLE_M,
             max_torque_n_m: 0.0,
             hand: std::ptr::null(),
+            edge: palpate_vector::default(),
+            burn_s: 0.0,
         }
     }
 }
@@ -275,7 +286,11 @@ unsafe impl Versioned for palpate_surface_options {
     }
 }
 
-unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
+/// Sets options to their defaults.
+///
+/// # Safety
+/// The pointer must be null, or valid for `size` bytes.
+pub(crate) unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
     guard(|| {
         if options.is_null() {
             return Err(CodedError::argument("options is null"));
@@ -326,8 +341,10 @@ pub enum palpate_tip_shape {
     PALPATE_TIP_DISC = 0,
     /// A flat rigid disc.
     PALPATE_TIP_RIGID_DISC = 1,
-    /// A rigid sphere, whose middle is at the position.
+    /// A rigid sphere, whose middle is at the position. Like the rigid disc it touches solids alone.
     PALPATE_TIP_SPHERE = 2,
+    /// A blade, which severs what its `edge` crosses.
+    PALPATE_TIP_BLADE = 3,
 }
 
 pub use palpate_tip_shape::*;
@@ -338,6 +355,7 @@ impl palpate_tip_shape {
             0 => Ok(TipShape::Disc),
             1 => Ok(TipShape::RigidDisc),
             2 => Ok(TipShape::Sphere),
+            3 => Ok(TipShape::Blade),
             _ => Err(CodedError::argument(format!("tip_shape is {number}: must be one of palpate_tip_shape"))),
         }
     }
@@ -416,14 +434,23 @@ impl palpate_touch_options {
         };
         // SAFETY: the caller's promise.
         let holder = unsafe { optional_text(self.holder, "holder") }?.unwrap_or("libpalpate").to_owned();
+        let axes = palpate_axes::of(self.axes)?;
         let tip = Tip {
             radius_m: within("tip_radius_m", self.tip_radius_m, 1e-4..=0.1)?,
             friction: within("friction", self.friction, 0.0..=10.0)?,
             grasps: self.grasps != 0,
             shape: palpate_tip_shape::of(self.tip_shape)?,
+            edge_m: axes.to_m(self.edge),
+            burn_s: within("burn_s", self.burn_s, 0.0..=3600.0)?,
             ..Tip::default()
         };
-        let axes = palpate_axes::of(self.axes)?;
+        // The edges of scissors are their jaws.
+        let has_edge = tip.shape == TipShape::Blade && self.jaws_m == 0.0;
+        if !(tip.edge_m.is_finite() && has_edge == (tip.edge_m != DVec3::ZERO)) {
+            return Err(CodedError::argument(
+                "edge: a blade that is not scissors needs a finite one above 0, and no other tip has one",
+            ));
+        }
         let instrument = self.instrument(axes, tip)?;
         // An instrument is rendered from a copy of any tissue.
         let prediction = if instrument.is_some() { self.prediction.max(2) } else { self.prediction };
@@ -470,7 +497,20 @@ impl palpate_touch_options {
             }
         }
         let mut instrument = Instrument::default();
-        instrument.add_parts(jaws, shaft);
+        if tip.shape == TipShape::Blade {
+            // Only the edge cuts: what is behind it touches.
+            let handle = Tip { shape: TipShape::Disc, edge_m: DVec3::ZERO, ..tip };
+            match jaws {
+                Some((length_m, blade)) => instrument.add_scissors(length_m, blade),
+                None => instrument = Instrument::of_tip(tip),
+            }
+            if let Some((length_m, _)) = shaft {
+                let from_m = if jaws.is_some() { instrument.hinge_m } else { tip.edge_m };
+                instrument.add_row(from_m, from_m - length_m * DVec3::X, handle, InstrumentPart::Body);
+            }
+        } else {
+            instrument.add_parts(jaws, shaft);
+        }
         let tips = instrument.tips.len();
         if tips > MAX_TIPS {
             let why = format!(

@@ -8,7 +8,7 @@ use std::time::Duration;
 use ::palpate_session::wire::scene::{MeshToSend, SceneToSend};
 use palpate_client::bridge::{SessionChoice, Target};
 use palpate_client::upload::upload_mesh;
-use palpate_client::{Channel, Credentials, Server, Token, fleet};
+use palpate_client::{Channel, Credentials, Followed, HeldTools, Server, Token, fleet};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use palpate_refusal::Refusal;
@@ -44,6 +44,8 @@ pub(crate) struct Connected {
 pub struct palpate_session {
     pub(crate) shared: Arc<Connected>,
     pub(crate) session_id: String,
+    /// The tools by which it lays threads and clips.
+    pub(crate) tools: Arc<HeldTools>,
     extent: palpate_extent,
 }
 
@@ -59,6 +61,24 @@ pub struct palpate_extent {
     pub middle_m: palpate_vector,
     /// The highest place of the surface above or below its middle: the origin of devices is placed there.
     pub top_m: palpate_vector,
+}
+
+/// The state of a session, from `palpate_session_status_of`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_session_status {
+    /// Number of steps done.
+    pub step: u64,
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// The version of what joins the points of the tissue; 0 if nothing was severed.
+    pub topology_version: u32,
+    /// Number of severed springs, or of severed faces between the cells of a solid.
+    pub severed: u32,
+    /// Number of parts of the tissue; 1 if it is whole.
+    pub pieces: u32,
+    /// 1 if a solid has no room for further cuts, so that blades only push; else 0.
+    pub cuts_exhausted: u32,
 }
 
 /// A change of the tissue's coefficients. A value that is NaN leaves the coefficient as it is.
@@ -117,6 +137,16 @@ impl Connected {
 }
 
 impl palpate_session {
+    /// Returns the session's state on the server.
+    pub(crate) fn get(&self) -> Result<pb::Session, CodedError> {
+        let request = pb::GetSessionRequest { session_id: self.session_id.clone() };
+        let answer = self.shared.follow(|mut sessions| {
+            let request = request.clone();
+            async move { sessions.get_session(request).await }
+        })?;
+        Ok(answer.into_inner().session.unwrap_or_default())
+    }
+
     /// Returns the target of a tool with these options.
     pub(crate) fn target(&self, options: &TouchOptions) -> Target {
         Target {
@@ -227,7 +257,10 @@ fn handle(shared: &Arc<Connected>, session: Option<pb::Session>) -> Result<*mut 
     let top_m = extent.top_m.or(extent.middle_m);
     let [least_m, most_m, middle_m, top_m] = [extent.least_m, extent.most_m, extent.middle_m, top_m].map(place);
     let extent = palpate_extent { least_m, most_m, middle_m, top_m };
-    let handle = palpate_session { shared: shared.clone(), session_id: session.session_id, extent };
+    let session_id = session.session_id;
+    let followed = Followed::new(shared.server.clone(), shared.channel.clone(), session_id.clone());
+    let tools = Arc::new(HeldTools::new(Arc::new(followed), "libpalpate"));
+    let handle = palpate_session { shared: shared.clone(), session_id, tools, extent };
     Ok(Box::into_raw(Box::new(handle)))
 }
 
@@ -429,6 +462,28 @@ pub unsafe extern "C" fn palpate_session_extent(
         // SAFETY: the caller's promises.
         let (session, out) = unsafe { (at(session, "session is null")?, at_mut(extent, "extent is null")?) };
         *out = session.extent;
+        Ok(())
+    })
+}
+
+/// Writes the present state of the session. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_status_of(
+    session: *const palpate_session,
+    status: *mut palpate_session_status,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, out) = unsafe { (at(session, "session is null")?, at_mut(status, "status is null")?) };
+        let session = session.get()?;
+        *out = palpate_session_status {
+            step: session.step,
+            time_s: session.simulation_time_s,
+            topology_version: session.topology_version,
+            severed: session.severed,
+            pieces: session.pieces,
+            cuts_exhausted: u32::from(session.cuts_exhausted),
+        };
         Ok(())
     })
 }

@@ -337,6 +337,36 @@ int main(int count, char **arguments) {
     EXPECT(palpate_session_change(same, &change), PALPATE_OK, NULL);
     palpate_session_free(same);
 
+    /* Threads and clips. */
+    palpate_tie_options stitch;
+    palpate_tie tie;
+    size_t tied = 9;
+    palpate_vector bites[2] = {{0.03, 0.03, 0.0}, {0.03, 0.035, 0.0}};
+    EXPECT(palpate_tie_options_init(&stitch, sizeof stitch), PALPATE_OK, NULL);
+    EXPECT(palpate_session_thread(NULL, 0, &stitch), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_session_thread(session, 0, &stitch), PALPATE_ARGUMENT, "bites is null");
+    stitch.bites = bites, stitch.bite_count = 17;
+    EXPECT(palpate_session_clip(session, 0, &stitch), PALPATE_ARGUMENT, "17");
+    stitch.bite_count = 2;
+    EXPECT(palpate_session_thread(session, 0, &stitch), PALPATE_REFUSED, "length_m");
+    stitch.length_m = 0.004;
+    EXPECT(palpate_session_thread(session, 64, &stitch), PALPATE_REFUSED, "number");
+    EXPECT(palpate_session_ties(session, NULL, 0, &tied), PALPATE_OK, NULL);
+    if (tied != 0) failures++, fprintf(stderr, "%zu threads that were refused\n", tied);
+    EXPECT(palpate_session_clip(session, 3, &stitch), PALPATE_OK, NULL);
+    for (int look = 0; tied != 1 && look < 500; look++) {
+        nanosleep(&(struct timespec){0, 10000000L}, NULL);
+        EXPECT(palpate_session_ties(session, NULL, 0, &tied), PALPATE_OK, NULL);
+    }
+    EXPECT(palpate_session_ties(session, &tie, 0, &tied), PALPATE_BUFFER, "1 threads");
+    EXPECT(palpate_session_ties(session, &tie, 1, &tied), PALPATE_OK, NULL);
+    if (tie.number != 3 || !tie.is_clip) failures++, fprintf(stderr, "clip %u\n", tie.number);
+    EXPECT(palpate_session_untie(session, 0, 3), PALPATE_OK, NULL);
+    EXPECT(palpate_session_release(session, 0), PALPATE_OK, NULL);
+    palpate_session_status status;
+    EXPECT(palpate_session_status_of(session, &status), PALPATE_OK, NULL);
+    if (status.pieces != 1 || status.severed != 0) failures++, fprintf(stderr, "%u pieces\n", status.pieces);
+
     /* Touch. */
     palpate_touch_options options;
     EXPECT(palpate_touch_options_init(&options, sizeof options), PALPATE_OK, NULL);
@@ -349,6 +379,15 @@ int main(int count, char **arguments) {
     options.tip_radius_m = NAN;
     EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "tip_radius_m");
     options.tip_radius_m = 0.005;
+    options.tip_shape = PALPATE_TIP_BLADE;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "edge");
+    options.tip_shape = PALPATE_TIP_DISC;
+    options.edge.z = 0.01;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "edge");
+    options.edge.z = 0.0;
+    options.burn_s = -1.0;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "burn_s");
+    options.burn_s = 0.0;
     options.tool = 1000000;
     EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_REFUSED, NULL);
     options.tool = 0;

@@ -26,6 +26,8 @@ using InstrumentFelt = palpate_instrument_felt;
 using Limits = palpate_limits;
 using Traffic = palpate_traffic;
 using Report = palpate_bridge_report;
+using Status = palpate_session_status;
+using Tie = palpate_tie;
 
 /// What went wrong.
 struct Error {
@@ -86,6 +88,11 @@ struct TouchOptions : palpate_touch_options {
         if (auto code = palpate_tool_count(this, &count)) return detail::error(code);
         return count;
     }
+};
+
+/// Options of a thread or clip. The fields are those of palpate_tie_options; Session sets the bites and the length.
+struct TieOptions : palpate_tie_options {
+    TieOptions() { palpate_tie_options_init(this, sizeof(palpate_tie_options)); }
 };
 
 /// One of the two hands of a program, for `hand` of TouchOptions; see palpate_two_hands.
@@ -346,6 +353,46 @@ public:
         if (auto code = palpate_session_change(session_.get(), &change)) return detail::error(code);
         return std::nullopt;
     }
+    /// Returns the state of the session: its time, and what is cut. Waits for the server.
+    Result<Status> status() const {
+        Status status{};
+        if (auto code = palpate_session_status_of(session_.get(), &status)) return detail::error(code);
+        return status;
+    }
+    /// Lays a thread through bites, or changes one that has these bites; see palpate_session_thread. Waits for the server.
+    std::optional<Error> thread(std::uint32_t number, const std::vector<Vector>& bites, double length_m,
+                                TieOptions options = {}) const {
+        options.length_m = length_m;
+        return tied(palpate_session_thread, number, bites, options);
+    }
+    /// Closes a clip on two bites; see palpate_session_clip. Waits for the server.
+    std::optional<Error> clip(std::uint32_t number, const std::vector<Vector>& bites, TieOptions options = {}) const {
+        return tied(palpate_session_clip, number, bites, options);
+    }
+    /// Cuts a thread or clip by a tool, and takes it out. Waits for the server.
+    std::optional<Error> untie(std::uint32_t tool, std::uint32_t number) const {
+        if (auto code = palpate_session_untie(session_.get(), tool, number)) return detail::error(code);
+        return std::nullopt;
+    }
+    /// Releases a tool that has laid threads or clips, which stay. Waits for the server.
+    std::optional<Error> release(std::uint32_t tool) const {
+        if (auto code = palpate_session_release(session_.get(), tool)) return detail::error(code);
+        return std::nullopt;
+    }
+    /// Returns the threads and clips of the session, of all its users. Waits for the server.
+    Result<std::vector<Tie>> ties() const {
+        for (;;) {
+            std::size_t count = 0;
+            if (auto code = palpate_session_ties(session_.get(), nullptr, 0, &count)) return detail::error(code);
+            std::vector<Tie> ties(count);
+            const auto code = palpate_session_ties(session_.get(), ties.data(), ties.size(), &count);
+            // Another user may lay one in between.
+            if (code == PALPATE_BUFFER) continue;
+            if (code) return detail::error(code);
+            ties.resize(count);
+            return ties;
+        }
+    }
     /// Deletes the session on the server, for all users. Waits for the server.
     std::optional<Error> remove() const {
         if (auto code = palpate_session_delete(session_.get())) return detail::error(code);
@@ -354,6 +401,13 @@ public:
     explicit Session(palpate_session* session) : session_(session) {}
 
 private:
+    template <class Lay>
+    std::optional<Error> tied(Lay lay, std::uint32_t number, const std::vector<Vector>& bites, TieOptions& options) const {
+        options.bites = bites.data();
+        options.bite_count = bites.size();
+        if (auto code = lay(session_.get(), number, &options)) return detail::error(code);
+        return std::nullopt;
+    }
     detail::Handle<palpate_session, palpate_session_free> session_;
 };
 
