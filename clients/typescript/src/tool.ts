@@ -6,7 +6,7 @@
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { Datagrams } from "./datagrams.js";
-import type { CommandSchema, Sample, ToolSample } from "./gen/palpate/v1/haptic_pb.js";
+import type { ClipSchema, CommandSchema, Sample, ThreadSchema, TieSchema, ToolSample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Lead, poseOf } from "./poses.js";
 import { backoffMs, describe, isGone, isUnreached, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
@@ -195,6 +195,40 @@ export class Tool {
     this.tick();
   }
 
+  /**
+   * Lays thread `number` of the session, or changes its length, friction or strength if it has these bites already; takes the tool if
+   * needed. What the tool does goes on, and the thread stays when the tool is released. Returns whether the server accepts it;
+   * `onRefused` gets the reason.
+   */
+  thread(number: number, thread: MessageInitShape<typeof ThreadSchema>): Promise<boolean> {
+    return this.tie({ number, kind: { case: "thread", value: thread } });
+  }
+
+  /** Closes clip `number` on two places, otherwise as `thread`. Threads and clips share their numbers. */
+  clip(number: number, clip: MessageInitShape<typeof ClipSchema>): Promise<boolean> {
+    return this.tie({ number, kind: { case: "clip", value: clip } });
+  }
+
+  /** Cuts a thread or clip, and takes it out. */
+  untie(number: number): Promise<boolean> {
+    return this.tie({ number, kind: { case: "cut", value: {} } });
+  }
+
+  private async tie(value: MessageInitShape<typeof TieSchema>): Promise<boolean> {
+    if (!(await this.take())) return false;
+    const { leaseId, sessionId, tool } = this;
+    if (!leaseId) return false;
+    this.touchedMs = performance.now();
+    const command = { tool, sequence: this.next(), action: { case: "tie" as const, value } };
+    try {
+      await this.server.haptics.sendCommands({ sessionId, leaseId, commands: [command] }, { timeoutMs: CALL_TIMEOUT_MS });
+      return true;
+    } catch (error) {
+      if (this.leaseId === leaseId) this.failed(error);
+      return false;
+    }
+  }
+
   /** Releases the tool. */
   async letGo(): Promise<void> {
     const { leaseId, sessionId } = this;
@@ -269,12 +303,18 @@ export class Tool {
     this.fresh = false;
   }
 
-  /** Returns the commands of the next batch: one for each tool, all with the same sequence. */
-  private commands(wanted: Wanted | undefined, now: number): Command[] {
+  /** Returns the sequence of the next call. Datagrams after it begin anew. */
+  private next(): bigint {
     this.datagrams.rest();
     this.sequence += this.from === undefined ? 1n : APART;
     this.from = undefined;
-    const { sequence, tools } = this;
+    return this.sequence;
+  }
+
+  /** Returns the commands of the next batch: one for each tool, all with the same sequence. */
+  private commands(wanted: Wanted | undefined, now: number): Command[] {
+    const sequence = this.next();
+    const { tools } = this;
     const clientTimeNs = BigInt(Math.round(now * 1e6));
     if (!wanted) return tools.map((tool) => ({ tool, sequence, clientTimeNs, action: { case: "release", value: {} } }));
     this.first ??= sequence;

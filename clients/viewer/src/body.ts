@@ -2,7 +2,7 @@
 // are area-weighted sums of the triangle normals. Only what changed is recomputed: vertices and triangles are divided
 // into blocks of neighbours. These blocks also speed up ray casts.
 
-import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, type Ray, Vector3 } from "three";
+import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, type Ray, Triangle, Vector3 } from "three";
 import { Field, type MeshData, type Vec3 } from "palpate";
 import { Looks, type AmbientOcclusion } from "./ambient-occlusion";
 import { edgesOf, type Lists, lists, opening, touching } from "./topology";
@@ -487,6 +487,30 @@ export class Body implements Surface, WoundedSurface {
     if (hit) return this.place(hit.triangle, hit.weights, n);
     const isOuter = this.isOuter(place);
     return this.atVertex(this.vertexNear(from.addScaledVector(n, high)), isOuter);
+  }
+
+  at(restM: Vec3): Place {
+    const point = new Vector3(...restM);
+    const corner = (vertex: number) => new Vector3(...this.rest.subarray(3 * vertex, 3 * vertex + 3));
+    let [nearest, leastM2] = [0, Infinity];
+    for (let vertex = 0; vertex < this.vertexCount; vertex++) {
+      const farM2 = [0, 1, 2].reduce((sum, c) => sum + (this.rest[3 * vertex + c]! - restM[c]!) ** 2, 0);
+      if (farM2 < leastM2) [nearest, leastM2] = [vertex, farM2];
+    }
+    // In one of the triangles around the nearest vertex.
+    const { start, of } = this.around;
+    let best: { triangle: number; weights: Vec3; farM: number } | undefined;
+    for (let k = start[nearest]!; k < start[nearest + 1]!; k++) {
+      const triangle = of[k]!;
+      const [a, b, c] = [0, 1, 2].map((at) => corner(this.triangles[3 * triangle + at]!)) as [Vector3, Vector3, Vector3];
+      const flat = new Triangle(a, b, c);
+      const at = flat.closestPointToPoint(point, new Vector3());
+      const weights = flat.getBarycoord(at, new Vector3());
+      const farM = at.distanceTo(point);
+      if (weights && farM < (best?.farM ?? Infinity)) best = { triangle, weights: weights.toArray(), farM };
+    }
+    if (!best) return this.atVertex(nearest, true);
+    return this.place(best.triangle, best.weights, this.outerAt({ restM, outward: [0, 0, 0], ...best }).negate());
   }
 
   nearest(place: Place): Place {

@@ -12,7 +12,7 @@ import { Grasper, type View } from "./grasper";
 import { server } from "./server";
 import type { Place, Surface } from "./surface";
 
-export type Mode = "push" | "pull" | "stroke" | "tip" | "blade" | "grasper";
+export type Mode = "push" | "pull" | "stroke" | "tip" | "blade" | "grasper" | "thread" | "clip";
 
 /** Length of a blade's edge, in depths of the deepest cut: it reaches out of the tissue, also of one that gives way. */
 const EDGE = 2;

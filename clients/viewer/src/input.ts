@@ -6,6 +6,7 @@ import type { Hand, Reach } from "./hand";
 import type { Hands } from "./hands";
 import type { Latency } from "./latency";
 import type { Stage } from "./stage";
+import { sews, type Sewing } from "./sewing";
 import type { Place, Surface } from "./surface";
 
 /** What the user can touch. */
@@ -20,10 +21,16 @@ const TURN = 0.08;
 /** Opening of the jaws per pixel of the wheel, per event at most, and per key press. */
 const WHEEL = { pixel: 0.0015, most: 0.15 };
 const JAW_STEP = 0.15;
+/** A press that moves by less is a tap, pixels. */
+const TAP_PX = 8;
 
 export class Input {
   /** If set, gets the next press on the tissue instead of a touch. */
   onPlace: ((place: Place) => void) | undefined;
+  /** Gets what picks the places of a thread or clip, instead of a touch. */
+  sewing: Sewing | undefined;
+  /** A press that picks a place when it ends where it began: a drag turns the view. */
+  private tap: { pointer: number; at: [number, number]; place: Place } | undefined;
   /** Called with the place under a pointer that does not touch, and without a place when it leaves. */
   onPoint: (place?: Place) => void = () => {};
   /** The newest drag of each hand; also of a parked one, which nothing leads. */
@@ -80,14 +87,20 @@ export class Input {
       if (!hands.isTwo || !this.beginBeside(hands, event)) this.beginPinch(leading, event);
       return;
     }
+    this.tap = undefined;
     // A second finger turns the view instead.
     if (this.fingers.size > 1) return this.finish();
     if (event.button !== 0 || leading) return;
     const place = this.stage.pick(event.clientX, event.clientY);
     // Beside the tissue a drag turns the view.
-    this.stage.turnByDrag(!place);
+    const isTap = place !== undefined && !this.onPlace && sews(hands.chosen.mode);
+    this.stage.turnByDrag(!place || isTap);
     if (!place) return;
     this.onPoint();
+    if (isTap) {
+      this.tap = { pointer: event.pointerId, at: [event.clientX, event.clientY], place };
+      return;
+    }
     if (this.onPlace) return this.onPlace(place);
     this.latency.pressed(event.timeStamp);
     this.lead(hands.chosen, place, event);
@@ -192,7 +205,14 @@ export class Input {
     drag.moveTo(clientX, clientY);
   }
 
-  private up({ pointerId }: PointerEvent): void {
+  private up({ pointerId, type, clientX, clientY }: PointerEvent): void {
+    const { tap } = this;
+    if (tap?.pointer === pointerId) {
+      this.tap = undefined;
+      this.stage.turnByDrag(false);
+      const isStill = Math.hypot(clientX - tap.at[0], clientY - tap.at[1]) < TAP_PX;
+      if (type === "pointerup" && isStill) this.sewing?.pick(tap.place);
+    }
     this.fingers.delete(pointerId);
     if (this.pinch?.finger === pointerId) this.pinch = undefined;
     this.end(this.ledBy(pointerId));
@@ -237,7 +257,11 @@ export class Input {
       this.stage.setAim(this.aim);
     } else if (event.key === " ") {
       const hand = hands.chosen;
-      if (!event.repeat && !byKeys && (!hand.touches || hand.isParked)) {
+      if (sews(hand.mode)) {
+        this.aim ??= this.first(touched);
+        this.stage.setAim(this.aim);
+        if (!event.repeat) this.sewing?.pick(this.aim);
+      } else if (!event.repeat && !byKeys && (!hand.touches || hand.isParked)) {
         this.aim ??= this.first(touched);
         this.latency.pressed(event.timeStamp);
         this.begin(hand, this.aim, "keys");
@@ -252,8 +276,12 @@ export class Input {
       hands.choose(event.key === "1" ? 0 : 1);
     } else if (event.key === "PageUp" || event.key === "PageDown") {
       this.moveJaws(hands.chosen.grasper.opening + (event.key === "PageUp" ? JAW_STEP : -JAW_STEP));
+    } else if (event.key === "Enter" && sews(hands.chosen.mode)) {
+      if (!event.repeat) void this.sewing?.lay();
+    } else if (event.key === "Backspace" && sews(hands.chosen.mode)) {
+      this.sewing?.unpick();
     } else if (event.key === "Escape") {
-      void hands.chosen.letGo();
+      if (!this.sewing?.drop()) void hands.chosen.letGo();
     } else if (event.key === "Home") {
       this.stage.resetView();
     } else if (event.key === "+" || event.key === "-") {

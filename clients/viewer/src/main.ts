@@ -26,6 +26,7 @@ import { BACK_S, discard, type Opened, Player } from "./player";
 import { Plots } from "./plot";
 import { playScript } from "./script";
 import { backoffMs, describe, type Failure, isGone, isPassing, CALL_TIMEOUT_MS, reasonOf, server, sessions, sleep } from "./server";
+import { Sewing, sews } from "./sewing";
 import { Stage } from "./stage";
 import { Status } from "./status";
 import { excerpt } from "./text";
@@ -104,6 +105,9 @@ const player = new Player({
 // A recording can only be watched.
 const input = new Input(canvas, stage, latency, () => (shownSession?.session.playback ? undefined : shownSession));
 input.onPoint = (place) => overlay.point(place, shownSession?.reach.lengthM);
+
+const sewing = new Sewing(stage, { present: () => shownSession, onChange: () => {} });
+input.sewing = sewing;
 
 const lumps = new Lumps(stage, input, {
   present: () => shownSession,
@@ -295,6 +299,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   for (const id of ["fineness", "fineness-term", "fineness-meaning"]) part(id, HTMLElement).hidden = !isFine;
   part("look-explained", HTMLElement).textContent = isFine ? "What are net and fineness?" : "What is the net?";
   tellControls();
+  sewing.begin();
   tissue.begin(session);
   const name = session.scene?.name ?? "";
   if (session.playback) choices.markRecorded(session.playback, name);
@@ -408,6 +413,8 @@ function heard(session: Session): void {
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
   tellUndo(shownSession);
+  sewing.tell();
+  warnIfExhausted(shownSession);
   holding();
 }
 
@@ -471,6 +478,8 @@ function tellControls(): void {
   part("meaning", HTMLElement).textContent = meaningText(shownSession);
   for (const choice of modeChoices()) choice.checked = choice.value === shownSession.hand.mode;
   part("strength", HTMLInputElement).value = String(shownSession.hand.strength);
+  part("strength-part", HTMLElement).hidden = sews(shownSession.hand.mode);
+  part("view", HTMLElement).classList.toggle("sews", sews(shownSession.hand.mode));
   tellJaws();
   tellHands();
 }
@@ -531,6 +540,7 @@ part("mode", HTMLElement).addEventListener("change", () => {
   if (!shownSession) return;
   shownSession.hand.mode = chosenMode();
   tellControls();
+  if (!sewing.drop()) sewing.tell();
 });
 part("strength", HTMLInputElement).addEventListener("input", (event) => {
   if (shownSession) shownSession.hand.strength = Number((event.target as HTMLInputElement).value);
@@ -568,6 +578,7 @@ part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   const surface = shownSession.refine(Number((event.target as HTMLInputElement).value));
   stage.show(surface, true);
   tellControls();
+  sewing.tell();
 });
 part("what-was-that", HTMLButtonElement).addEventListener("click", () => void whatWasThat());
 part("undo-cut", HTMLButtonElement).addEventListener("click", () => void undoCut());
@@ -626,6 +637,14 @@ function warnIfFar(of: ShownSession): void {
   if (of === warnedIn || of.surface.largestM() <= Math.max(of.surface.sizeM, of.reach.lengthM)) return;
   warnedIn = of;
   notice("The tissue moved farther than its longest side. Look at the forces and the stiffness: a unit may be wrong.", 15);
+}
+
+/** The session in which the user was told that there is no room for further cuts. */
+let exhaustedIn: ShownSession | undefined;
+function warnIfExhausted(of: ShownSession): void {
+  if (of === exhaustedIn || !of.session.cutsExhausted || of.session.severed === 0) return;
+  exhaustedIn = of;
+  notice("This solid has no room for further cuts: from now on a blade only pushes.", 15);
 }
 
 stage.onDrawn = () => {
@@ -722,7 +741,7 @@ function isStill({ frames, samples, session, speed }: ShownSession): boolean {
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-Object.assign(window, { palpate: pageState(() => shownSession, stage, player, latency) });
+Object.assign(window, { palpate: pageState(() => shownSession, stage, player, latency, sewing) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";

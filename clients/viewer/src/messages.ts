@@ -74,6 +74,7 @@ export function meaningText({ hand, reach, surface }: ShownSession): string {
       "they go below the tissue at rest while they are open; closed, they hold what is between them, and move with the drag."
     );
   }
+  if (hand.mode === "thread" || hand.mode === "clip") return "A thread or clip stays when you let go of the tool, and belongs to the session.";
   return surface.edge
     ? "Strength is the push in the middle of the tool. It fades out over about " +
       `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
@@ -108,11 +109,12 @@ function toldText(told: Told, verb: string): string {
 }
 
 /** Describes what blades have cut, as far as it is known here; undefined if nothing is. */
-export function cutText({ session: { severed, pieces }, cutters, wound }: ShownSession): string | undefined {
+export function cutText({ session: { severed, pieces, cutsExhausted }, cutters, wound }: ShownSession): string | undefined {
   if (severed === 0) return undefined;
   const parts = pieces > 1 ? `, in ${pieces} pieces` : "";
   const by = cutters.size > 0 ? `, by ${[...cutters].join(", ")}` : "";
-  return `${severed} springs${parts}${by}${wound.staysWhole ? "; drawn whole: it has other vertices than points" : ""}`;
+  const full = cutsExhausted ? "; no room for more" : "";
+  return `${severed} springs${parts}${by}${full}${wound.staysWhole ? "; drawn whole: it has other vertices than points" : ""}`;
 }
 
 /** Says why the last cut can't be undone; empty if it can. */

@@ -5,12 +5,13 @@ import type { Latency } from "./latency";
 import { pictureFrom } from "./pictures";
 import type { Player } from "./player";
 import { received } from "./server";
+import type { Sewing } from "./sewing";
 import { Sheet } from "./sheet";
 import type { Stage } from "./stage";
 import type { ShownSession } from "./session";
 
 /** The page's state as numbers, for tests and measurements. */
-export function pageState(present: () => ShownSession | undefined, stage: Stage, player: Player, latency: Latency) {
+export function pageState(present: () => ShownSession | undefined, stage: Stage, player: Player, latency: Latency, sewing: Sewing) {
   return {
     get frames() {
       const { taken, skipped, newest } = present()?.frames ?? { taken: 0, skipped: 0n };
@@ -58,6 +59,13 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
       const { session, wound, surface } = present() ?? {};
       const { shown, waiting } = surface?.wound.count ?? { shown: 0, waiting: 0 };
       return { severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting, mostAtOnce: surface?.wound.mostAtOnce ?? 0 };
+    },
+    /** The threads and clips of the session, and how many places are picked for the next one. */
+    get sewing() {
+      const ties = (present()?.session.ties ?? []).map(({ tie, lengthM, pathM, tensionN, broken }) => {
+        return { number: tie?.number ?? 0, kind: tie?.kind.case, lengthM, pathM, tensionN, broken };
+      });
+      return { ties, picked: sewing.picked };
     },
     get holds() {
       return present()?.hands.holding !== undefined;

@@ -2,7 +2,7 @@
 // the flank of the tissue, down to the height of the drawn body.
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Plane, type Ray, Vector3 } from "three";
-import { Field, type Rectangle } from "palpate";
+import { Field, type Rectangle, type Vec3 } from "palpate";
 import { SheetEdge } from "./sheet-edge";
 import type { Scene } from "palpate/v1";
 import type { Felt } from "./samples";
@@ -310,6 +310,10 @@ export class Sheet implements Surface, WoundedSurface {
 
   beside({ restM: [x, y] }: Place, way: Vector3): Place {
     return this.placeOf(x + way.x, y + way.y);
+  }
+
+  at([x, y]: Vec3): Place {
+    return this.placeOf(x, y);
   }
 
   private get pointSpacingM(): number {

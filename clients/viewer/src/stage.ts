@@ -23,6 +23,7 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { type ShownTie, TieMarks } from "./tie-marks";
 import { BladeMark, isSameBlade, type ShownBlade } from "./blade-mark";
 import { Body } from "./body";
 import { Effort, isDrawnBySoftware } from "./effort";
@@ -103,6 +104,7 @@ export class Stage {
   private graspers: ShownGrasper[] = [];
   private readonly bladeMarks = [new BladeMark(), new BladeMark()];
   private blades: ShownBlade[] = [];
+  private readonly tieMarks = new TieMarks();
   private aim: Place | undefined;
   /** Whether the camera is still in its initial position. */
   private isHome = true;
@@ -140,7 +142,7 @@ export class Stage {
     this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !this.isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.camera.up.set(0, 0, 1);
-    this.scene.add(this.camera, ...[...this.grasperMarks, ...this.bladeMarks].map(({ group }) => group));
+    this.scene.add(this.camera, this.tieMarks.group, ...[...this.grasperMarks, ...this.bladeMarks].map(({ group }) => group));
     this.orbit = new OrbitControls(this.camera, canvas);
     // The left button and one finger control the tool.
     this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.PAN, RIGHT: MOUSE.ROTATE };
@@ -290,6 +292,14 @@ export class Stage {
     this.later ??= setTimeout(() => this.draw(), ALONE_MS);
   }
 
+  /** Shows threads and clips, or those of before if `ties` is undefined, and the places that are picked for the next one. */
+  setTies(ties: readonly ShownTie[] | undefined, picked: readonly Place[]): void {
+    if (ties === undefined && picked === this.tieMarks.picked) return;
+    this.tieMarks.ties = ties ?? this.tieMarks.ties;
+    this.tieMarks.picked = picked;
+    this.draw();
+  }
+
   /** Places the tools on the tissue as it is drawn now. */
   private placeTools(): void {
     const surface = this.surface;
@@ -311,6 +321,7 @@ export class Stage {
       if (tool && surface) mark.show(tool, surface, surface.sizeM, this.seen, this.graspers.length + this.blades.length + index);
       else mark.hide();
     });
+    if (surface) this.tieMarks.place(surface);
     const ring = light.rings.value[SHADOWS]!;
     if (!this.aim || !surface || this.held) return;
     const at = this.spot.set(...this.aim.restM).add(surface.displacementAt(this.aim));

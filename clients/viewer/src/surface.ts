@@ -76,6 +76,8 @@ export interface Surface extends WoundedSurface {
   middle(): Place;
   /** Returns the place approximately at the offset `way` from another. */
   beside(place: Place, way: Vector3): Place;
+  /** Returns the place nearest to a point at rest, on the outer side. */
+  at(restM: Vec3): Place;
   /** Returns the mass point nearest to a place. */
   nearest(place: Place): Place;
   /**

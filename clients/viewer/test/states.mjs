@@ -92,6 +92,16 @@ const STATES = {
     await page.page.waitForTimeout(2500);
     return { page };
   },
+  sewing: async (context) => {
+    const page = await shown(context, "?scene=liver&tool=thread&name=Ann");
+    const tap = async (/** @type {number} */ x, /** @type {number} */ y) => await page.page.mouse.click(...(await page.at(x, y)));
+    for (const [x, y] of [[0.42, 0.42], [0.54, 0.48], [0.42, 0.54]]) await tap(x, y);
+    await page.page.click("#lay");
+    await page.until(({ sewing }) => sewing.ties.length === 1);
+    for (const [x, y] of [[0.62, 0.42], [0.7, 0.5]]) await tap(x, y);
+    await page.page.waitForTimeout(2500);
+    return { page };
+  },
   lumps: async (context) => {
     const page = await shown(context, "");
     await page.page.check("#lumps");
