@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::HapticDevice;
-use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run, two_hands};
+use palpate_client::bridge::{
+    BridgeReport, CutButton, Options, SessionChoice, Target, Tick, Traffic, Warn, run, two_hands,
+};
 use palpate_client::devices::{self, DeviceKind, Placed, Placement};
 use palpate_haptics::instrument::MAX_TIPS;
 use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
@@ -80,6 +82,13 @@ pub(crate) struct BridgeArguments {
     /// Warn and count when the torque between the jaws of the instrument exceeds this, N·m: then they crush what they hold
     #[arg(long, value_name = "N_M", requires = "jaws_m")]
     jaw_torque_limit_n_m: Option<f64>,
+    /// While this button of the device is held, the tool is a blade of the radius of its tip, and cuts; the first is 0. When it is let go, the
+    /// blade cuts no more, and touches again once it is out of the tissue. Forces come without a copy of the tissue
+    #[arg(long, value_name = "NUMBER", conflicts_with_all = ["jaws_m", "shaft_m", "up_deadband"])]
+    cut_button: Option<u32>,
+    /// With --cut-button: length of the blade's edge, m. It stands on the tip, along z of the device, and turns with its handle
+    #[arg(long, value_name = "M", default_value_t = 0.02, requires = "cut_button")]
+    blade_m: f64,
     /// The simulated hand that holds a simulated device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
@@ -152,6 +161,23 @@ fn instrument(arguments: &BridgeArguments, tip: Tip) -> Result<Option<Instrument
     Ok(Some(instrument))
 }
 
+/// Returns the button that cuts, if there is one.
+fn cut_button(arguments: &BridgeArguments, placement: &Placement) -> Result<Option<CutButton>, ClientFailure> {
+    let Some(button) = arguments.cut_button else { return Ok(None) };
+    let refuse = |why: &str| Err(ClientFailure::Refused(format!("--cut-button: {why}")));
+    if arguments.prediction == When::Always {
+        return refuse("a copy of the tissue knows no blade: not with --prediction always");
+    }
+    if placement.clutch_button == Some(button) {
+        return refuse("is the button of the clutch: give another --clutch-button, or --no-clutch");
+    }
+    if button >= u32::BITS {
+        return refuse("a device has at most 32 buttons, the first is 0");
+    }
+    let length_m = number("--blade-m", arguments.blade_m, "above 0 and at most 0.5", |m| m > 0.0 && m <= 0.5)?;
+    Ok(Some(CutButton { button, length_m }))
+}
+
 /// Opens the real device of a name, or makes a simulated one, whose hand moves by a stream of random numbers.
 fn device(arguments: &BridgeArguments, name: &str, stream: u64) -> Result<Box<dyn HapticDevice>, ClientFailure> {
     if DeviceKind::of(name).is_some() {
@@ -188,6 +214,7 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
         holder: "palpate-client bridge".to_owned(),
     };
     let instrument = instrument(arguments, target.tip)?;
+    let cut_button = cut_button(arguments, &placement)?;
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
     let lasts = lasts.map_err(|error| ClientFailure::Refused(format!("--seconds: {error}")))?;
     // Last, so that what is refused is refused before a device moves.
@@ -196,9 +223,9 @@ pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFail
     let options = |hand| {
         // Force and torque on an instrument come from a copy of any tissue.
         let prediction = if instrument.is_some() { When::Always } else { arguments.prediction };
-        let (warn, copies) = (Some(Box::new(warn) as Warn), prediction.copies());
+        let (warn, copies) = (Some(Box::new(warn) as Warn), prediction.copies().filter(|_| cut_button.is_none()));
         let (keeps_session, instrument) = (arguments.keep_session, instrument.clone());
-        Options { lasts, remembers, keeps_session, warn, copies, hand, instrument, ..Options::default() }
+        Options { lasts, remembers, keeps_session, warn, copies, hand, instrument, cut_button, ..Options::default() }
     };
     let (served, second) = match &arguments.second_device {
         None => (run(first, target, options(None), interrupted()).await?.1, None),

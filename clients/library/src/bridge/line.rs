@@ -21,6 +21,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic_types::StatusExt;
 
 use super::copy_fetch::{Copier, Copying};
+use super::cut_button::{CutButton, CuttingTip};
 use super::ticker::{LoopFeed, ToolPose};
 use super::{Copies, SessionChoice, Target};
 use crate::Error;
@@ -130,6 +131,7 @@ const COMMANDS: usize = 64;
 pub(super) async fn keep(
     target: Target,
     instrument: Option<Instrument>,
+    cut_button: Option<CutButton>,
     copies: Option<Copies>,
     device: Device,
     shared: &Shared,
@@ -149,6 +151,7 @@ pub(super) async fn keep(
         let ended = connect(
             &target,
             instrument.as_ref(),
+            cut_button,
             copier.as_ref(),
             &mut trail,
             &device,
@@ -303,6 +306,7 @@ fn broken(why: &str) -> Error {
 async fn connect(
     target: &Target,
     instrument: Option<&Instrument>,
+    cut_button: Option<CutButton>,
     copier: Option<&Copier>,
     trail: &mut Trail,
     device: &Device,
@@ -363,6 +367,9 @@ async fn connect(
     shared.opened.notify_one();
     // Commands that waited while the stream was opened are outdated.
     while commands.queue.pop().is_some() {}
+    let mut cutting = cut_button.map(|button| CuttingTip::new(target.tip, button));
+    // The sequence of the newest release. Until the server has it, poses follow it by the stream: a datagram would overtake it.
+    let mut released = 0;
     let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
     // Counts of earlier connections.
     let before = shared.inbound().traffic.carried;
@@ -384,6 +391,13 @@ async fn connect(
             };
         }
         feed.receive(sample, datagrams.wanted_s());
+    };
+    let look = |sample: &pb::Sample, cutting: &mut Option<CuttingTip>, released: &mut u64| {
+        let Some(tool) = sample.tools.iter().find(|tool| tool.tool == target.tool) else { return };
+        cutting.iter_mut().for_each(|cutting| cutting.take(tool));
+        if tool.acknowledged_sequence > *released {
+            *released = 0;
+        }
     };
     loop {
         tokio::select! {
@@ -409,6 +423,7 @@ async fn connect(
                             return Err(broken("the session was stopped by its guard"));
                         }
                         if trail.is_current(sample.ownership_revision) && datagrams.is_newer(&sample) {
+                            look(&sample, &mut cutting, &mut released);
                             take(&sample, &mut datagrams, feed);
                         }
                     }
@@ -438,16 +453,29 @@ async fn connect(
             },
             sample = datagrams.next() => {
                 if trail.is_current(sample.ownership_revision) {
+                    look(&sample, &mut cutting, &mut released);
                     take(&sample, &mut datagrams, feed);
                 }
             }
             command = commands.recv() => {
-                let Some(ToolPose { client_time_ns, pose, velocity_m_per_s }) = command else { return Ok(()) };
+                let Some(ToolPose { client_time_ns, pose, velocity_m_per_s, orientation, buttons }) = command else { return Ok(()) };
+                let led = cutting.as_mut().map(|cutting| cutting.next(pose.place_m, orientation, buttons));
+                let (tip, is_released) = led.unwrap_or((target.tip, false));
+                if is_released {
+                    trail.sequence += 1;
+                    released = trail.sequence;
+                    let (tool, sequence, action) = (target.tool, Some(released), Some(Action::Release(pb::Release {})));
+                    let release = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
+                    // It must not be dropped, as the next pose has another tip. Samples wait meanwhile.
+                    if outbound.send(Say::Command(release)).await.is_err() {
+                        return Err(end_of(&mut stream).await);
+                    }
+                }
                 trail.sequence += 1;
                 let velocity_m_per_s = velocity_m_per_s.and_then(vector);
                 let action = Some(match instrument {
                     Some(_) => Action::Instrument(of_instrument::pose(&pose)),
-                    None => Action::Pose(pb::Pose { velocity_m_per_s, ..touch::pose(pose.place_m, &target.tip) }),
+                    None => Action::Pose(pb::Pose { velocity_m_per_s, ..touch::pose(pose.place_m, &tip) }),
                 });
                 let (tool, sequence) = (target.tool, Some(trail.sequence));
                 let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
@@ -456,7 +484,7 @@ async fn connect(
                     // If it does not get through, a later tick requests it again.
                     let _ = outbound.try_send(Say::Renew(pb::Renew { client_time_ns, datagrams: true }));
                 }
-                if datagrams.send(&command) {
+                if released == 0 && datagrams.send(&command) {
                     continue;
                 }
                 // If the network does not keep up, this command is dropped; the next one replaces it.

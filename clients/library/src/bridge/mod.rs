@@ -8,6 +8,7 @@
 
 mod copy_fetch;
 mod copy_thread;
+mod cut_button;
 mod hand_slot;
 mod hands;
 mod lateness;
@@ -33,6 +34,7 @@ use crate::device::HapticDevice;
 use crate::os::{self, Priority};
 use line::{Commands, Shared};
 
+pub use cut_button::CutButton;
 pub use hand_slot::{HandSlot, two_hand_slots};
 pub use hands::{BridgeHand, two_hands};
 pub use line::Traffic;
@@ -116,7 +118,7 @@ impl Disable {
 
 /// Options of [`run`] and [`begin`]. By default there is no time limit, nothing is recorded or shown, the priority is
 /// the usual one, a created session is deleted at the end, and no tissue is copied. [`begin`] uses only
-/// `keeps_session`, `warn`, `copies`, `hand` and `instrument`.
+/// `keeps_session`, `warn`, `copies`, `hand`, `instrument` and `cut_button`.
 #[derive(Default)]
 pub struct Options {
     /// Time after which [`run`] ends, from the first tick, which does not wait for a connection; `None`: no limit.
@@ -146,18 +148,32 @@ pub struct Options {
     /// [`Target::tool`] on. Force and torque come from a copy of the tissue, so `copies` is needed. `None`: the single tip of
     /// [`Target::tip`].
     pub instrument: Option<Instrument>,
+    /// The button of the device by which its single tip cuts while it is held. Forces then come from local models, as a copy of the tissue
+    /// knows only the tip: not with `copies`, an instrument or [`Target::up_deadband`]. `None`: it never cuts.
+    pub cut_button: Option<CutButton>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, copies, hand, instrument } =
-            self;
+        let Options {
+            lasts,
+            remembers,
+            real_time,
+            keeps_session,
+            warn,
+            begun,
+            disable: _,
+            copies,
+            hand,
+            instrument,
+            cut_button,
+        } = self;
         let mut fields = f.debug_struct("Options");
         fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
         fields.field("keeps_session", keeps_session);
         fields.field("warn", &warn.is_some()).field("begun", &begun.is_some());
         fields.field("copies", &copies.is_some()).field("hand", &hand.is_some());
-        fields.field("instrument", instrument).finish()
+        fields.field("instrument", instrument).field("cut_button", cut_button).finish()
     }
 }
 
@@ -320,13 +336,21 @@ fn silent() -> Error {
 struct Led {
     hand: Option<BridgeHand>,
     instrument: Option<Instrument>,
+    cut_button: Option<CutButton>,
 }
 
 impl Led {
     /// # Errors
-    /// Returns [`Error::Argument`] for an instrument without tips or without a copy of the tissue, or whose tools have no numbers.
+    /// Returns [`Error::Argument`] for a button that cuts with what that does not go with, or whose edge is not above 0; for an instrument without tips or without a copy of the tissue, or whose tools have no numbers.
     fn of(target: &Target, options: &mut Options) -> Result<Self, Error> {
-        let Options { hand, instrument, copies, .. } = options;
+        let Options { hand, instrument, copies, cut_button, .. } = options;
+        if let Some(CutButton { length_m, .. }) = *cut_button {
+            let is_alone = instrument.is_none() && copies.is_none() && target.up_deadband == 0.0;
+            if !(is_alone && length_m > 0.0 && length_m.is_finite()) {
+                let why = "cut_button: needs an edge above 0, and goes neither with an instrument nor with copies or `up_deadband`";
+                return Err(Error::Argument(why.to_owned()));
+            }
+        }
         let refuse = |why: &str| Err(Error::Argument(format!("instrument: {why}")));
         if let Some(instrument) = instrument {
             let tips = u32::try_from(instrument.tips.len()).unwrap_or(u32::MAX);
@@ -337,7 +361,7 @@ impl Led {
                 return refuse("is rendered from a copy of the tissue: allow copies");
             }
         }
-        Ok(Led { hand: hand.take(), instrument: instrument.take() })
+        Ok(Led { hand: hand.take(), instrument: instrument.take(), cut_button: *cut_button })
     }
 }
 
@@ -355,7 +379,7 @@ fn line(
 ) -> (Ticker, Connection) {
     let server = target.server.clone();
     let (ticker, feed, queue) = ticker::ticker(device, origin, target.up_deadband);
-    let Led { hand, instrument } = led;
+    let Led { hand, instrument, cut_button } = led;
     let ticker = ticker.of_hand(hand, target.tool, target.tip).of_instrument(instrument.clone());
     let (shared, news) = (Arc::new(Shared::default()), Arc::new(Notify::new()));
     let commands = Commands { queue, news: news.clone() };
@@ -366,7 +390,7 @@ fn line(
             // The text may contain parts that a server has written.
             let warn = |message: &str| warn.iter().for_each(|warn| warn(&printable(message)));
             tokio::select! {
-                () = line::keep(target, instrument, copies, device, &shared, feed, commands, &warn) => {}
+                () = line::keep(target, instrument, cut_button, copies, device, &shared, feed, commands, &warn) => {}
                 // The loop then detects that it is over.
                 () = stop => {}
             }

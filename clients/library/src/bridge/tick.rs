@@ -119,6 +119,7 @@ fn tick(
         if disable.take() {
             ticker.disable();
         }
+        ticker.press(device.buttons());
         let wrench = ticker.tick_turned(reading, device.orientation(), device.jaw_rad(), time_s);
         let force_n = wrench.force_n;
         if ticker.has_instrument() {

@@ -31,6 +31,10 @@ pub(super) struct ToolPose {
     pub(super) pose: InstrumentPose,
     /// Velocity, m/s, if the server is to extrapolate the motion.
     pub(super) velocity_m_per_s: Option<DVec3>,
+    /// The orientation of the device, also if it leads a single tip.
+    pub(super) orientation: DQuat,
+    /// The buttons of the device that are pressed.
+    pub(super) buttons: u32,
 }
 
 /// What the network side sends to the ticks, in order.
@@ -105,6 +109,7 @@ pub struct Ticker {
     /// The instrument that the device leads; `None`: a single tip.
     instrument: Option<Instrument>,
     was_asked: bool,
+    buttons: u32,
     news: News,
     clock: Clock,
     place_m: DVec3,
@@ -164,6 +169,7 @@ pub(super) fn ticker(
         renderer: LoopRenderer::Tip(Box::new(Renderer::new(Law::linear(0.0, 0.0), Envelope::new(device, DVec3::ZERO)))),
         instrument: None,
         was_asked: false,
+        buttons: 0,
         news: News::default(),
         clock: Clock::default(),
         place_m: DVec3::ZERO,
@@ -328,16 +334,23 @@ impl Ticker {
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let client_time_ns = (now_s * 1e9) as u64;
+        let still = ToolPose { client_time_ns, pose, velocity_m_per_s: None, orientation, buttons: self.buttons };
         let command = if let Some(way_m) = renderer.way_m(self.up_deadband) {
             let heartbeat_s = if connection == self.connection && wanted_s > 0.0 { wanted_s } else { HEARTBEAT_S };
             let told = self.news.tell(now_s, place_m, way_m, heartbeat_s);
-            told.map(|told| ToolPose { client_time_ns, pose, velocity_m_per_s: Some(told.velocity_m_per_s) })
+            told.map(|told| ToolPose { velocity_m_per_s: Some(told.velocity_m_per_s), ..still })
         } else {
-            Some(ToolPose { client_time_ns, pose, velocity_m_per_s: None })
+            Some(still)
         };
         // If the network does not keep up, this position is dropped; the next one replaces it.
         self.has_spoken = command.is_some_and(|command| self.commands.push(command).is_ok());
         wrench
+    }
+
+    /// Sets the buttons of the device that are pressed from the next tick on, bit n for button n ([`super::Options::cut_button`]). By
+    /// default none is.
+    pub fn press(&mut self, buttons: u32) {
+        self.buttons = buttons;
     }
 
     /// Applies the events since the last tick, as long as there is room to give back what they replace.
