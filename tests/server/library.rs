@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::common::server::{self, TEST_TIMEOUT, TestServer, force, open};
 use glam::DVec3;
-use palpate_client::bridge::{Options, SessionChoice, Target, Tick, run};
+use palpate_client::bridge::{CutButton, Options, SessionChoice, Target, Tick, run};
 use palpate_client::devices::{Enables, Placed, Placement};
 use palpate_client::view::Frames;
 use palpate_client::watch::Samples;
@@ -351,4 +351,115 @@ async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand
     let (placed, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it did not end").unwrap().unwrap();
     assert_eq!(*placed.device().orders.force_n.lock().unwrap(), DVec3::ZERO);
     assert_eq!(report.lost.map(|error| error.to_string()), None);
+}
+
+/// A device that goes to the next place of a course when the test says so, and holds its button on the way there if the place says so.
+struct Scalpel {
+    /// Places from the middle of the workspace, m, and whether the button is held.
+    course: &'static [([f64; 3], bool)],
+    /// The place to go to, and the last one that was reached.
+    goal: Arc<AtomicU32>,
+    reached: Arc<AtomicU32>,
+    from_m: DVec3,
+    towards: u32,
+    ticks: u32,
+    is_held: bool,
+    felt: Arc<Notify>,
+}
+
+/// Ticks on the way between two places.
+const WAY_TICKS: u32 = 300;
+
+impl HapticDevice for Scalpel {
+    fn descriptor(&self) -> Device {
+        Device::named("omega3").unwrap()
+    }
+
+    fn read(&mut self) -> std::io::Result<Reading> {
+        let goal = self.goal.load(Ordering::Relaxed);
+        let to_m = |place: u32| DVec3::from_array(self.course[place as usize].0);
+        if goal != self.towards {
+            (self.from_m, self.towards, self.ticks) = (to_m(self.towards), goal, 0);
+        }
+        self.ticks += 1;
+        let part = f64::from(self.ticks.min(WAY_TICKS)) / f64::from(WAY_TICKS);
+        if self.ticks == WAY_TICKS {
+            self.reached.store(goal, Ordering::Relaxed);
+        }
+        self.is_held = self.course[goal as usize].1;
+        Ok(Reading { place_m: self.from_m.lerp(to_m(goal), part), enable: self.ticks % 100 < 50 })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+        if force_n.z > 0.05 && self.towards as usize + 1 == self.course.len() {
+            self.felt.notify_one();
+        }
+        Ok(())
+    }
+
+    fn buttons(&self) -> u32 {
+        u32::from(self.is_held) << 2
+    }
+
+    fn button_count(&self) -> u32 {
+        3
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_cuts_while_its_button_is_held_and_then_touches_again() {
+    const COURSE: &[([f64; 3], bool)] = &[
+        ([-0.00125, -0.015, 0.003], false),
+        ([-0.00125, -0.015, -0.006], true),
+        ([-0.00125, 0.015, -0.006], true),
+        ([-0.00125, 0.015, -0.0061], false),
+        ([0.015, 0.015, -0.006], false),
+        ([0.015, 0.015, 0.004], false),
+        ([0.015, 0.0, -0.003], false),
+    ];
+    let server = TestServer::start(&[]);
+    let session_id = create(at(&server).connect().await.unwrap(), "liver").await;
+    let [goal, reached] = [0, u32::MAX].map(|value| Arc::new(AtomicU32::new(value)));
+    let felt = Arc::new(Notify::new());
+    let device = Scalpel {
+        course: COURSE,
+        goal: goal.clone(),
+        reached: reached.clone(),
+        from_m: DVec3::from_array(COURSE[0].0),
+        towards: 0,
+        ticks: 0,
+        is_held: false,
+        felt: felt.clone(),
+    };
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let cut_button = Some(CutButton { button: 2, length_m: 0.02 });
+    let serving = tokio::spawn(run(
+        device,
+        target(&server, SessionChoice::Existing(session_id.clone())),
+        Options { cut_button, ..Options::default() },
+        async move { drop(stopped.await) },
+    ));
+    let mut severed = Vec::new();
+    let whole_course = async {
+        for place in 0..COURSE.len() as u32 {
+            goal.store(place, Ordering::Relaxed);
+            while reached.load(Ordering::Relaxed) != place {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            // What was sent has acted.
+            let step = server.status(&session_id).await.step + 300;
+            while server.status(&session_id).await.step < step {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            severed.push(server.status(&session_id).await.severed);
+        }
+        felt.notified().await;
+    };
+    tokio::time::timeout(TEST_TIMEOUT, whole_course).await.expect("no force");
+    drop(stop);
+    let (_, report) = serving.await.unwrap().unwrap();
+    // Twelve rows of springs along 30 mm; the way across cuts nothing.
+    assert!(severed[0] == 0 && severed[3] >= 24, "{severed:?}");
+    assert!(severed[3..].iter().all(|count| *count == severed[3]), "{severed:?}");
+    assert_eq!(report.traffic.refused, 0);
 }
