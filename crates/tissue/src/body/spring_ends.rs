@@ -79,7 +79,7 @@ impl Model {
     /// Returns where the end of a spring at a place in memory is at rest, m: in a solid the middle of a cube.
     pub(crate) fn end_at_rest_m(&self, place: usize) -> DVec3 {
         match &self.places {
-            Places::Solid(places) => places.rest_m(place) + 0.5 * places.edge_m(),
+            Places::Solid(places) => places.middle_m(place),
             Places::Sheet(_) | Places::Surface(_) => self.shape().rest_m(self.point_at(place)),
         }
     }

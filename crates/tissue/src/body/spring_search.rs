@@ -41,40 +41,50 @@ impl SpringSearch {
         self.longest_m
     }
 
-    /// Returns the corners of a box around the points of a tile, m; `moved` are the tiles whose points may not be at rest.
-    pub(crate) fn tile_box_m<T: Real>(
+    /// Returns whether the box around the points of a tile touches that between two corners, m; `moved` are the tiles whose points may not
+    /// be at rest. A box counts from that at rest, and grows by displacements.
+    pub(crate) fn touches<T: Real>(
         &self,
         model: &Model,
         layout: &Layout,
         state: &State<T>,
         moved: &Marks,
         tile: usize,
-    ) -> [DVec3; 2] {
+        [least_m, most_m]: [DVec3; 2],
+    ) -> bool {
         let [low_m, high_m] = self.boxes[tile];
+        let (below, above) = (high_m.cmplt(least_m), low_m.cmpgt(most_m));
         if !moved.has[tile] {
-            return [low_m, high_m];
+            return !(below | above).any();
         }
-        let [rows, columns] = sides_of(layout, tile);
-        // A lane for each column: only then does the compiler compare a row at once.
-        #[allow(clippy::needless_range_loop)]
-        let bounds = |c: usize| {
-            let (mut low, mut high) = ([T::default(); TILE], [T::default(); TILE]);
-            for i in rows.clone() {
-                let row = &state.u[c * layout.plane + i * layout.stride..][columns.clone()];
-                let (low, high) = (&mut low[..row.len()], &mut high[..row.len()]);
-                // Not zipped: the compiler calls a function for each row then.
-                for lane in 0..row.len() {
-                    let value = row[lane];
-                    low[lane] = if value < low[lane] { value } else { low[lane] };
-                    high[lane] = if value > high[lane] { value } else { high[lane] };
-                }
+        // Along the other axes the boxes touch already at rest.
+        (0..3).filter(|c| (below | above).test(*c)).all(|c| {
+            let sign = if below.test(c) { T::of(1.0) } else { T::of(-1.0) };
+            let most = largest(layout, &state.u[c * layout.plane..], tile, sign).wide();
+            if below.test(c) {
+                high_m[c] + model.unit_m * most >= least_m[c]
+            } else {
+                low_m[c] - model.unit_m * most <= most_m[c]
             }
-            let low = low.iter().map(|value| value.wide()).fold(0.0, f64::min);
-            [low, high.iter().map(|value| value.wide()).fold(0.0, f64::max)]
-        };
-        let [x, y, z] = [bounds(0), bounds(1), bounds(2)];
-        [low_m + model.unit_m * DVec3::new(x[0], y[0], z[0]), high_m + model.unit_m * DVec3::new(x[1], y[1], z[1])]
+        })
     }
+}
+
+/// Returns the largest value in a tile of a plane, times 1 or −1; at least 0.
+fn largest<T: Real>(layout: &Layout, plane: &[T], tile: usize, sign: T) -> T {
+    let [rows, columns] = sides_of(layout, tile);
+    // A lane for each column: only then does the compiler compare a row at once.
+    let mut most = [T::default(); TILE];
+    for i in rows {
+        let row = &plane[i * layout.stride..][columns.clone()];
+        let most = &mut most[..row.len()];
+        // Not zipped: the compiler calls a function for each row then.
+        for lane in 0..row.len() {
+            let value = sign * row[lane];
+            most[lane] = if value > most[lane] { value } else { most[lane] };
+        }
+    }
+    most.into_iter().fold(T::default(), |most, value| if value > most { value } else { most })
 }
 
 /// Returns the places of a tile.

@@ -225,6 +225,13 @@ impl<T: Real> SweepTables<T> {
         Some(doubled)
     }
 
+    /// Returns where the corners of a solid's cube beside cuts are in a plane of a field, by its number among these
+    /// ([`CornerCopies::cubes`]).
+    #[inline]
+    pub(crate) fn cut_offsets(&self, number: usize) -> Option<[usize; 8]> {
+        self.solid.as_ref()?.cut_offsets(number)
+    }
+
     /// Makes a copy of a corner fixed if the corner is.
     fn hold_copy(&mut self, place: usize) {
         let Some(copies) = self.severed.copies() else { return };

@@ -179,8 +179,7 @@ impl<T: Real> TissueState<T> {
             (model.unit_m * vector(&state.u), ways * vector(&state.d))
         };
         for tile in 0..tiles.tile_count() {
-            let [low_m, high_m] = search.tile_box_m(model, layout, state, &tiles.moved, tile);
-            if high_m.cmplt(least_m - reach_m).any() || low_m.cmpgt(most_m + reach_m).any() {
+            if !search.touches(model, layout, state, &tiles.moved, tile, [least_m - reach_m, most_m + reach_m]) {
                 continue;
             }
             let [rows, columns] = sides_of(layout, tile);

@@ -10,6 +10,9 @@
 
 #![allow(clippy::cast_possible_truncation)]
 
+use glam::DVec3;
+
+use crate::body::solid::place_numbers::PlaceNumbers;
 use crate::body::solid::places::SolidPlaces;
 
 /// The part of the cubes around a corner that share a copy of it.
@@ -36,6 +39,8 @@ struct CornerCopy {
 pub(crate) struct CutCube {
     /// Its least corner.
     pub(crate) cube: u32,
+    /// Its middle at rest, m.
+    pub(crate) middle_m: DVec3,
     /// The places of its corners.
     pub(crate) corners: [u32; 8],
 }
@@ -52,17 +57,30 @@ pub(crate) struct DoubledCorner {
     corner: u32,
 }
 
+/// A corner, or a copy of it, whose cubes fall into two parts.
+#[derive(Debug)]
+struct CornerSplit {
+    /// Its part; `None` if the corner was whole.
+    part: Option<usize>,
+    /// The part that a whole corner is.
+    whole: CornerPart,
+    /// The cubes that get a copy, by bits as in [`CornerPart`].
+    moved: u8,
+    /// The cubes around the corner.
+    around: [Option<usize>; 8],
+}
+
 /// The copies of the corners of a solid. Empty if nothing is cut.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct CornerCopies {
     /// The parts of doubled corners; after each, the next one of its corner.
     parts: Vec<CornerPart>,
     next: Vec<u32>,
-    /// For each corner, its first part; [`NONE`] if it is whole.
-    first_of: Vec<u32>,
+    /// For each corner that is not whole, its first part.
+    first_of: PlaceNumbers,
     /// The cubes that have copies, in the order in which they got them; and for each least corner, its place in this list.
     cubes: Vec<CutCube>,
-    cube_at: Vec<u32>,
+    cube_at: PlaceNumbers,
     /// The copies, by their places.
     copies: Vec<CornerCopy>,
     /// The first spare place, and how many there are.
@@ -70,7 +88,7 @@ pub(crate) struct CornerCopies {
     spare: usize,
 }
 
-/// The number of no part and of no cube.
+/// The number of no part.
 const NONE: u32 = u32::MAX;
 
 /// The most corners that one face can double.
@@ -83,9 +101,9 @@ impl CornerCopies {
         CornerCopies {
             parts: Vec::new(),
             next: Vec::new(),
-            first_of: vec![NONE; places.count()],
+            first_of: PlaceNumbers::default(),
             cubes: Vec::new(),
-            cube_at: vec![NONE; places.count()],
+            cube_at: PlaceNumbers::default(),
             copies: Vec::new(),
             first_spare: spare.start as u32,
             spare: spare.len(),
@@ -154,7 +172,7 @@ impl CornerCopies {
     /// Returns the place of a cube in the list of those that have copies.
     #[inline]
     pub(crate) fn number_of(&self, cube: usize) -> Option<usize> {
-        self.cube_at.get(cube).filter(|at| **at != NONE).map(|at| *at as usize)
+        self.cube_at.get(cube)
     }
 
     /// Returns the places of the corners of a cube, x before y before z, if it has copies among them.
@@ -185,15 +203,14 @@ impl CornerCopies {
 
     /// Returns the numbers of the parts of a corner; none if it is whole.
     fn parts_of(&self, corner: usize) -> impl Iterator<Item = usize> {
-        let number = |at: u32| (at != NONE).then_some(at as usize);
-        let first = self.first_of.get(corner).copied().and_then(number);
-        std::iter::successors(first, move |at| number(self.next[*at]))
+        let next = |at: &usize| Some(self.next[*at]).filter(|at| *at != NONE).map(|at| at as usize);
+        std::iter::successors(self.first_of.get(corner), next)
     }
 
     /// Returns the places of a corner: its own, and those of its copies.
     pub(crate) fn places_of(&self, corner: usize) -> impl Iterator<Item = usize> {
         let of_parts = self.parts_of(corner).map(|part| self.parts[part].place as usize);
-        of_parts.chain([corner].into_iter().filter(move |_| self.first_of[corner] == NONE))
+        of_parts.chain([corner].into_iter().filter(move |_| self.first_of.get(corner).is_none()))
     }
 
     /// Severs the face of a cube with the higher coordinate along an axis, in a version of the topology. `is_severed` tells of each such face whether it is
@@ -205,17 +222,46 @@ impl CornerCopies {
         version: u32,
         is_severed: impl Fn(usize, usize) -> bool,
     ) -> Vec<DoubledCorner> {
+        let splits = self.splits(places, (cube, axis), is_severed);
+        splits
+            .into_iter()
+            .map(|split| {
+                let part = split.part.unwrap_or_else(|| self.add_part(split.whole));
+                self.double(places, part, (split.moved, version), &split.around)
+            })
+            .collect()
+    }
+
+    /// Returns the places that [`CornerCopies::sever`] would double.
+    pub(crate) fn doubled_by(
+        &self,
+        places: &SolidPlaces,
+        face: (usize, usize),
+        is_severed: impl Fn(usize, usize) -> bool,
+    ) -> Vec<usize> {
+        let splits = self.splits(places, face, is_severed);
+        let of = |split: &CornerSplit| split.part.map_or(split.whole.corner, |part| self.parts[part].place);
+        splits.iter().map(|split| of(split) as usize).collect()
+    }
+
+    /// Returns the corners of a face whose cubes fall apart if it is severed. Of one corner that does not depend on the others.
+    fn splits(
+        &self,
+        places: &SolidPlaces,
+        (cube, axis): (usize, usize),
+        is_severed: impl Fn(usize, usize) -> bool,
+    ) -> Vec<CornerSplit> {
         let bit = 1 << axis;
         let Some(beyond) = places.cube_across(cube, axis, true) else { return Vec::new() };
-        let mut made = Vec::new();
+        let mut found = Vec::new();
         // The corners of the face are those of the cube beyond it that are lower along the axis.
         for (number, corner) in
             places.corners_of(beyond).into_iter().enumerate().filter(|(number, _)| number & bit == 0)
         {
             let around = cubes_around(places, corner);
             let part = self.parts_of(corner).find(|part| self.parts[*part].cubes >> number & 1 == 1);
-            let of_whole = CornerPart { corner: corner as u32, cubes: mask_of(&around), place: corner as u32 };
-            let cubes = part.map_or(of_whole.cubes, |part| self.parts[part].cubes);
+            let whole = CornerPart { corner: corner as u32, cubes: mask_of(&around), place: corner as u32 };
+            let cubes = part.map_or(whole.cubes, |part| self.parts[part].cubes);
             // The corner is a higher one of the cube before the face.
             if cubes >> (number | bit) & 1 == 0 {
                 continue;
@@ -226,10 +272,9 @@ impl CornerCopies {
                 continue;
             }
             let moved = if beyond_face.count_ones() <= before_face.count_ones() { beyond_face } else { before_face };
-            let part = part.unwrap_or_else(|| self.add_part(of_whole));
-            made.push(self.double(places, part, (moved, version), &around));
+            found.push(CornerSplit { part, whole, moved, around });
         }
-        made
+        found
     }
 
     /// Gives some cubes of a part a copy of its corner.
@@ -249,8 +294,8 @@ impl CornerCopies {
             let Some(cube) = cube.filter(|_| moved >> number & 1 == 1) else { continue };
             let at = self.number_of(cube).unwrap_or_else(|| {
                 let corners = places.corners_of(cube).map(|place| place as u32);
-                self.cube_at[cube] = self.cubes.len() as u32;
-                self.cubes.push(CutCube { cube: cube as u32, corners });
+                self.cube_at.set(cube, self.cubes.len() as u32);
+                self.cubes.push(CutCube { cube: cube as u32, middle_m: places.middle_m(cube), corners });
                 self.cubes.len() - 1
             });
             self.cubes[at].corners[number] = to;
@@ -261,8 +306,8 @@ impl CornerCopies {
     /// Adds a part. Returns its number.
     fn add_part(&mut self, part: CornerPart) -> usize {
         let corner = part.corner as usize;
-        self.next.push(self.first_of[corner]);
-        self.first_of[corner] = self.parts.len() as u32;
+        self.next.push(self.first_of.get(corner).map_or(NONE, |at| at as u32));
+        self.first_of.set(corner, self.parts.len() as u32);
         self.parts.push(part);
         self.parts.len() - 1
     }

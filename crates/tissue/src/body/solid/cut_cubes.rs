@@ -63,6 +63,12 @@ impl<T: Real> CutCubes<T> {
         self.weights.resize(self.corners.len() + BLOCK, T::default());
     }
 
+    /// Returns where the corners of the cube of a number are in a plane of a field.
+    #[inline]
+    pub(crate) fn offsets_of(&self, number: usize) -> [usize; 8] {
+        self.corners[number].map(|at| at as usize)
+    }
+
     /// Returns the forces on the corners of a block of a row; `None` if it has none.
     ///
     /// # Safety

@@ -13,6 +13,7 @@ pub(crate) mod footprint;
 pub(crate) mod inversion;
 pub(crate) mod linear_cells;
 pub(crate) mod neo_hookean;
+pub(crate) mod place_numbers;
 pub(crate) mod places;
 pub(crate) mod sweep;
 

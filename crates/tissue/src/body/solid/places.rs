@@ -177,6 +177,19 @@ impl SolidPlaces {
         self.shape.corner_m(place)
     }
 
+    /// Returns the middle at rest of the cube of which a place is the least corner, m.
+    pub(crate) fn middle_m(&self, cube: usize) -> DVec3 {
+        self.rest_m(cube) + 0.5 * self.edge_m()
+    }
+
+    /// Returns where the corners of a cube without copies are in a plane of a field, in the order of [`SolidPlaces::corners_of`].
+    #[inline(always)]
+    pub(crate) fn offsets_of(&self, layout: &Layout, cube: usize) -> [usize; 8] {
+        let at = layout.offset(cube);
+        let (across, up) = (at + layout.stride, at + layout.stride * self.corners[1]);
+        [at, at + 1, across, across + 1, up, up + 1, up + layout.stride, up + layout.stride + 1]
+    }
+
     /// Returns the places of the corners of the cube of which `cube` is the least corner: those farther along x after the
     /// nearer ones, then along y, then along z.
     #[inline(always)]

@@ -222,6 +222,12 @@ impl<T: Real> SolidTables<T> {
         self.weights[layout.offset(copies.cubes()[number].cube as usize)] = T::default();
     }
 
+    /// Returns where the corners of the cube beside cuts of a number are in a plane of a field.
+    #[inline]
+    pub(crate) fn cut_offsets(&self, number: usize) -> Option<[usize; 8]> {
+        self.cut.as_ref().map(|cut| cut.offsets_of(number))
+    }
+
     /// Sets the mass of a corner or a copy.
     fn weigh(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, place: usize) {
         let (at, mass) = (layout.offset(place), copies.mass(places, place));
@@ -518,7 +524,7 @@ pub(crate) fn gather<T: Real>(
     for beside in 0..2 {
         let stress = places.cubes_around(place, beside).map(|cube| {
             cube.map(|cube| {
-                let corners = places.corners_of(cube).map(|corner| layout.offset(corner));
+                let corners = places.offsets_of(layout, cube);
                 let patterns =
                     Patterns::of_corners(&corners.map(|at| [0, 1, 2].map(|c| Scalar(u[c * layout.plane + at]))));
                 let is_cut = copies.is_some_and(|copies| copies.number_of(cube).is_some());

@@ -11,8 +11,9 @@ use glam::DVec3;
 use super::{Crossing, EdgeSweep};
 use crate::body::severed::SeveredSpring;
 use crate::body::solid::SolidPlaces;
-use crate::body::solid::corner_copies::{CutCube, corners_of};
+use crate::body::solid::corner_copies::{CornerCopies, CutCube};
 use crate::body::spring_ends::SpringEnd;
+use crate::body::tables::SweepTables;
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
 use crate::state::tissue_state::TissueState;
@@ -39,10 +40,9 @@ impl<T: Real> TissueState<T> {
             place_m.cmpge(least_m - reach_m).all() && place_m.cmple(most_m + reach_m).all()
         };
         // By the displacement of the least corner alone: a cube's middle follows.
+        let reach_m = (REACH + SLACK) * model.unit_m;
         for tile in 0..tiles.tile_count() {
-            let [low_m, high_m] = search.tile_box_m(model, layout, state, &tiles.moved, tile);
-            let reach_m = (REACH + SLACK) * model.unit_m;
-            if high_m.cmplt(least_m - reach_m).any() || low_m.cmpgt(most_m + reach_m).any() {
+            if !search.touches(model, layout, state, &tiles.moved, tile, [least_m - reach_m, most_m + reach_m]) {
                 continue;
             }
             let [rows, columns] = sides_of(layout, tile);
@@ -59,11 +59,14 @@ impl<T: Real> TissueState<T> {
                 }
             }
         }
-        // Beside a cut, a cube may be anywhere.
+        // Beside a cut, a cube may be where its least corner is not, but a copy of it.
         let cut = tables.severed.copies().map_or(&[][..], |copies| copies.cubes());
-        for CutCube { cube, corners } in cut {
-            let u = self.vector(&state.u, corners[0] as usize);
-            if is_near(model.end_at_rest_m(*cube as usize) + model.unit_m * u, REACH + SLACK) {
+        for (number, CutCube { cube, middle_m, corners }) in cut.iter().enumerate() {
+            if corners[0] == *cube {
+                continue;
+            }
+            let Some([at, ..]) = tables.cut_offsets(number) else { continue };
+            if is_near(*middle_m + model.unit_m * self.vector_at(&state.u, at), REACH + SLACK) {
                 self.crossed_faces_of(places, *cube as usize, sweep, &is_near, &mut found);
             }
         }
@@ -121,11 +124,13 @@ impl<T: Real> TissueState<T> {
     /// Returns the displacement of the middle of a cube and its way in this step, m.
     fn middle_motion_m(&self, places: &SolidPlaces, cube: usize) -> [DVec3; 2] {
         let TissueState { model, plan, tables, state, .. } = self;
-        let corners = corners_of(places, tables.severed.copies().map(|copies| &**copies), cube);
+        let number = tables.severed.copies().and_then(|copies| copies.number_of(cube));
+        let of_cut = number.and_then(|number| tables.cut_offsets(number));
+        let corners = of_cut.unwrap_or_else(|| places.offsets_of(&tables.layout, cube));
         let (mut u, mut d) = (DVec3::ZERO, DVec3::ZERO);
-        for corner in corners {
-            u += self.vector(&state.u, corner);
-            d += self.vector(&state.d, corner);
+        for at in corners {
+            u += self.vector_at(&state.u, at);
+            d += self.vector_at(&state.d, at);
         }
         let eighth_m = 0.125 * model.unit_m;
         [eighth_m * u, eighth_m * f64::from(plan.substeps) * d]
@@ -150,7 +155,7 @@ impl<T: Real> TissueState<T> {
         if !self.tables.severed.has_room(&model) {
             return false;
         }
-        let before = self.forces_around(face.ends);
+        let before = self.forces_before(&face);
         let Some(doubled) = self.tables.sever(&model, face) else { return false };
         // A solid with cuts is awake as a whole, or asleep.
         self.tiles.wake_all();
@@ -181,19 +186,18 @@ impl<T: Real> TissueState<T> {
         true
     }
 
-    /// Returns the corners that two neighbouring cubes share, with the force on each divided by its mass, in the scheme's units.
-    fn forces_around(&self, cubes: [u32; 2]) -> Vec<(usize, [f64; 3])> {
-        if self.plan.scheme.history() == 0 {
-            return Vec::new();
-        }
-        let Some(places) = self.model.places.solid() else { return Vec::new() };
-        let copies = self.tables.severed.copies().map(|copies| &**copies);
-        let [first, second] = cubes.map(|cube| corners_of(places, copies, cube as usize));
-        first
-            .into_iter()
-            .filter(|corner| second.contains(corner))
-            .map(|corner| (corner, self.force_at(corner)))
-            .collect()
+    /// Returns the places that severing a face doubles, with the force on each divided by its mass, in the scheme's units; none if the
+    /// scheme keeps no past forces.
+    fn forces_before(&self, face: &SeveredSpring) -> Vec<(usize, [f64; 3])> {
+        let TissueState { model, plan, tables: SweepTables { severed, .. }, .. } = self;
+        let Some(places) = model.places.solid().filter(|_| plan.scheme.history() > 0) else { return Vec::new() };
+        let face = (face.ends[0] as usize, face.number as usize / 2);
+        let is_severed = |cube, axis| (cube, axis) == face || severed.has(model.first_end(cube) + 2 * axis);
+        let doubled = match severed.copies() {
+            Some(copies) => copies.doubled_by(places, face, is_severed),
+            None => CornerCopies::none(places).doubled_by(places, face, is_severed),
+        };
+        doubled.into_iter().map(|place| (place, self.force_at(place))).collect()
     }
 
     fn force_at(&self, place: usize) -> [f64; 3] {
