@@ -37,10 +37,16 @@ const MODULES: [(&str, &[&str]); 4] = [
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 17] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 18] = [
     ("crates/refusal", "palpate-refusal", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("crates/arguments", "palpate-arguments", &["palpate-refusal"], &["prost", "tokio", "tonic"]),
     ("crates/geometry", "palpate-geometry", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
+    (
+        "crates/exercise",
+        "palpate-exercise",
+        &["palpate-refusal"],
+        &["axum", "clap", "prost", "serde", "tokio", "tonic"],
+    ),
     ("crates/xtask", "palpate-xtask", &[], &["clap", "libc", "serde", "tokio"]),
     ("crates/haptics", "palpate-haptics", &[], &["axum", "prost", "tokio", "tonic"]),
     (
@@ -64,7 +70,14 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 17] = [
     (
         "crates/session",
         "palpate-session",
-        &["palpate-geometry", "palpate-haptics", "palpate-proto", "palpate-refusal", "palpate-tissue"],
+        &[
+            "palpate-exercise",
+            "palpate-geometry",
+            "palpate-haptics",
+            "palpate-proto",
+            "palpate-refusal",
+            "palpate-tissue",
+        ],
         &["axum", "clap", "gif", "hyper", "rcgen", "tokio-rustls"],
     ),
     (
@@ -85,6 +98,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 17] = [
         &[
             "palpate-arguments",
             "palpate-cluster",
+            "palpate-exercise",
             "palpate-geometry",
             "palpate-haptics",
             "palpate-proto",

@@ -27,6 +27,7 @@ pub mod journal;
 pub mod lease;
 pub mod led_instrument;
 pub mod local_model;
+pub mod measure_recorder;
 pub mod queue;
 pub mod recovery;
 pub mod rules;

@@ -81,7 +81,7 @@ pub fn run(
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Summary, SimulationFailure> {
-    run_with(model, script, options, limits, clock_s, &mut |told| write(output, progress, told))
+    run_with(model, script, options, limits, clock_s, &mut |told| write_event(output, progress, told))
 }
 
 /// Plays `script` on `model` from rest for a program that uses the records as values, in the calling thread. Calls
@@ -102,6 +102,23 @@ pub fn run_with(
     limits: &Limits,
     clock_s: &dyn Fn() -> f64,
     tell: &mut dyn FnMut(RunEvent<'_>) -> std::io::Result<()>,
+) -> Result<Summary, SimulationFailure> {
+    run_observed(model, script, options, limits, clock_s, tell, &mut |_| {})
+}
+
+/// Plays `script` as [`run_with`] does, and calls `observe` with the session at t = 0⁺ and at the end of each step, before
+/// the step's events. The summary's time excludes `observe`.
+///
+/// # Errors
+/// Returns the errors of [`run_with`].
+pub fn run_observed(
+    model: &Arc<Model>,
+    script: &Script,
+    options: RunOptions,
+    limits: &Limits,
+    clock_s: &dyn Fn() -> f64,
+    tell: &mut dyn FnMut(RunEvent<'_>) -> std::io::Result<()>,
+    observe: &mut dyn FnMut(&Session),
 ) -> Result<Summary, SimulationFailure> {
     let RunOptions { held, audit, profile } = options;
     let (mut twin, mut corrections) = (audit.then(|| Twin::new(model, (!held).then_some(script))), Vec::new());
@@ -135,11 +152,12 @@ pub fn run_with(
         resumed_s = clock_s();
         session.advance(due, |session| {
             ties.look(session);
+            stepping_s += clock_s() - resumed_s;
+            observe(session);
             if jaws.has_any() {
-                stepping_s += clock_s() - resumed_s;
                 jaws.look(script, session);
-                resumed_s = clock_s();
             }
+            resumed_s = clock_s();
             if session.step_count().is_multiple_of(script.sample_every) {
                 stepping_s += clock_s() - resumed_s;
                 if written.is_ok() {
@@ -315,9 +333,13 @@ fn disc(model: &Model, script: &Script) -> Disc {
     }
 }
 
-/// Writes an event of a run as a JSON line, or reports progress.
-fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'_>) -> std::io::Result<()> {
-    match told {
+/// Writes an event of a run to `output`, as a JSON line, or calls `progress` with the number of steps done: 0, 1024, 2048
+/// and so on.
+///
+/// # Errors
+/// Returns the error of writing.
+pub fn write_event(output: &mut dyn Write, progress: &mut dyn FnMut(u64), event: RunEvent<'_>) -> std::io::Result<()> {
+    match event {
         RunEvent::Run(run) => write_line(output, &Line::Run(run)),
         RunEvent::Record(record) => write_line(output, &record),
         RunEvent::Summary(summary) => write_line(output, &Line::Summary(summary)),

@@ -236,6 +236,11 @@ impl<'s> Replay<'s> {
         &self.first
     }
 
+    /// Returns the header of the journal.
+    pub fn header(&self) -> &pb::Header {
+        self.reader.header()
+    }
+
     /// Returns the survey of the journal that the replay was given.
     pub fn survey(&self) -> &Survey {
         &self.survey

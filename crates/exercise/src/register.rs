@@ -1,0 +1,88 @@
+//! The register: all measures, in the order in which they are told.
+
+use crate::definition::MeasureDefinition;
+use crate::{coverage, detection, force, hands, jerk, path, press, sparc, time};
+
+const DEFINITIONS: [&MeasureDefinition; 25] = [
+    &time::TIME,
+    &time::CONTACT_TIME,
+    &time::IDLE_TIME,
+    &path::PATH_LENGTH,
+    &path::ECONOMY,
+    &path::MEAN_SPEED,
+    &path::PEAK_SPEED,
+    &jerk::LOG_DIMENSIONLESS_JERK,
+    &sparc::SPARC,
+    &force::PEAK_FORCE,
+    &force::MEAN_FORCE,
+    &force::FORCE_INTEGRAL,
+    &force::FORCE_DERIVATIVE,
+    &force::ABOVE_LIMIT,
+    &force::PEAK_PRESSURE,
+    &force::PEAK_INDENTATION,
+    &force::WORK,
+    &press::PRESS_COUNT,
+    &press::MEAN_PRESS_TIME,
+    &press::SEARCH_TIME,
+    &hands::HAND_BALANCE,
+    &hands::BIMANUAL_IDLE,
+    &coverage::COVERAGE,
+    &coverage::COVERED_AREA,
+    &detection::D_PRIME,
+];
+
+/// Returns the definitions of all measures. `d_prime` needs the truth of an exercise; [`Measures`](crate::Measures) does
+/// not give it.
+pub fn definitions() -> impl Iterator<Item = &'static MeasureDefinition> {
+    DEFINITIONS.into_iter()
+}
+
+/// Returns the measure of a name; `None` if there is none.
+pub fn find(name: &str) -> Option<&'static MeasureDefinition> {
+    definitions().find(|definition| definition.name == name)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use glam::DVec3;
+
+    use super::*;
+    use crate::input::{MeasureOptions, PressedDisc, ToolRow};
+    use crate::measures::Measures;
+
+    #[test]
+    fn every_measure_has_a_figure_within_its_range_and_no_name_comes_twice() {
+        let corner = |x: f64, y: f64| DVec3::new(x, y, 0.0);
+        let surface = [[corner(0.0, 0.0), corner(0.1, 0.0), corner(0.0, 0.1)]];
+        let options = MeasureOptions { force_limit_n: Some(1.0), ..MeasureOptions::default() };
+        let mut measures = Measures::new(500.0, 0, options, surface.into_iter());
+        let mut random = fastrand::Rng::with_seed(5);
+        for _ in 0..3000 {
+            let mut rows: Vec<ToolRow> = Vec::new();
+            for tool in [3, 7] {
+                let mut number = || 2.0 * random.f64() - 1.0;
+                let (place_m, force_n) =
+                    (0.1 * DVec3::new(number(), number(), number()), DVec3::new(number(), 0.0, 1.0));
+                let is_in_contact = number() > 0.0;
+                let disc =
+                    PressedDisc { rest_m: place_m, normal: DVec3::Z, radius_m: 0.05, pressure_pa: 4e3 * number() };
+                let row = ToolRow { tool, place_m, force_n, is_in_contact, indentation_m: number(), disc: Some(disc) };
+                rows.extend((number() > -0.9).then_some(row));
+            }
+            measures.step(&rows);
+        }
+        let mut told = BTreeSet::from(["d_prime"]);
+        for figure in measures.figures() {
+            let MeasureDefinition { name, scope, range: [least, most], .. } = figure.definition;
+            assert!((*least..=*most).contains(&figure.value), "{name}: {}", figure.value);
+            let expected = if figure.tool.is_some() { crate::Scope::Tool } else { crate::Scope::Total };
+            assert!(*scope == crate::Scope::Both || *scope == expected, "{name} of {:?}", figure.tool);
+            told.insert(*name);
+        }
+        let all: Vec<&str> = definitions().map(|definition| definition.name).collect();
+        assert_eq!(all.len(), all.iter().collect::<BTreeSet<_>>().len());
+        assert_eq!(told, all.into_iter().collect());
+    }
+}
