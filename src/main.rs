@@ -27,6 +27,7 @@ enum ServerCommand {
         palpate run paper vertical-60\n  \
         palpate run liver press --output press.jsonl --plot\n  \
         palpate run prostate indent --depth-mm 2 --output curve.csv\n  \
+        palpate run liver stroke --output stroke.jsonl --score stroke.json --force-limit-n 2\n  \
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),

@@ -137,3 +137,62 @@ fn check_tells_what_helps_against_a_fast_vertex_as_tried() {
     let substeps = format!(", {} times a step", numbers[1]);
     assert!(text.contains(&substeps) || numbers[1] == 1 && text.contains("once a step"), "{advice}\n{text}");
 }
+
+/// Returns a figure of all tools in a score.
+fn figure(score: &serde_json::Value, name: &str) -> f64 {
+    let measures = score["measures"].as_array().unwrap();
+    let found = measures.iter().find(|measure| measure["name"] == name && measure.get("tool").is_none());
+    found.unwrap_or_else(|| panic!("{name} is not in {score}"))["value"].as_f64().unwrap()
+}
+
+#[test]
+fn a_score_has_what_the_tools_did_and_sessions_compare() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+    let run = |more: &[&str]| {
+        palpate(folder.path(), &[&["run", "liver", "press", "--quiet", "--output", "r.jsonl"], more].concat())
+    };
+    says(run(&["--score", "run.json", "--force-limit-n", "0.2"]), 0, &[]);
+    let score: serde_json::Value = serde_json::from_str(&read("run.json")).unwrap();
+    // 6 mm down and up, 71 N/m or more under a disc of 5 mm.
+    assert!((figure(&score, "path_length_m") - 0.012).abs() < 1e-6, "{score}");
+    assert_eq!((figure(&score, "time_s"), figure(&score, "press_count")), (2.0, 1.0));
+    let (peak_n, peak_pa) = (figure(&score, "peak_force_n"), figure(&score, "peak_pressure_pa"));
+    assert!(
+        peak_n > 0.28 && (peak_pa * std::f64::consts::PI * 2.5e-5 / peak_n - 1.0).abs() < 1e-3,
+        "{peak_n} {peak_pa}"
+    );
+    let disc_m2 = figure(&score, "covered_area_m2") / (std::f64::consts::PI * 2.5e-5);
+    assert!((disc_m2 - 1.0).abs() < 0.1, "{disc_m2}");
+    let crossing = &score["limit_crossings"][0];
+    assert!(score["limit_crossing_count"] == 1 && crossing["peak_n"] == peak_n, "{crossing}");
+    // The journal is simulated, and gives the same figures on paper and in the file.
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.5.mcap");
+    let scored = |more: &[&str]| palpate(folder.path(), &[&["journal", "score", golden], more].concat());
+    let (status, table) = scored(&["--output", "golden.json", "--report", "golden.html", "--force-limit-n", "1e-4"]);
+    assert_eq!((status, table.as_str()), (0, ""));
+    let (status, json) = scored(&["--json", "--force-limit-n", "1e-4"]);
+    assert_eq!((status, json), (0, read("golden.json")));
+    let report = read("golden.html");
+    for part in ["<svg", "data:image/png;base64,", "force_integral_n_s", "palpate journal render golden.5.mcap --at"] {
+        assert!(report.contains(part), "{part} is not in {report}");
+    }
+    let compared =
+        palpate(folder.path(), &["journal", "compare", "golden.json", "run.json", golden, "--csv", "all.csv"]);
+    says(compared, 0, &["has other thresholds", "sparc[0]", "50 %", "golden.5.mcap"]);
+    let csv = read("all.csv");
+    let columns: Vec<usize> = csv.lines().map(|line| line.split(',').count()).collect();
+    assert!(columns.len() == 4 && columns.iter().all(|count| *count == columns[0]), "{csv}");
+    for (arguments, part) in [
+        (&["run", "liver", "press", "--force-limit-n", "2"][..], "--force-limit-n: goes with --score FILE alone"),
+        (&["run", "liver", "indent", "--score", "s.json"], "--score: goes with a script, not with `indent`"),
+        (&["run", "liver", "press", "--score", "s.json", "--press-n", "-1"], "--press-n: must be above 0"),
+        (&["journal", "score", golden, "--hand", "0,1"], "--hand: must be two hands"),
+        (&["journal", "score", golden, "--hand", "0", "--hand", "0"], "--hand: a tool must be in one hand only"),
+        (&["journal", "score", "run.json"], "run.json"),
+        (&["journal", "compare", &at("r.jsonl")], "is neither a journal nor a score"),
+    ] {
+        says(palpate(folder.path(), arguments), 2, &[part]);
+    }
+}

@@ -11,6 +11,7 @@ pub(crate) mod organ;
 pub(crate) mod render;
 pub(crate) mod run;
 mod scene;
+mod score;
 pub(crate) mod serve;
 #[cfg(windows)]
 pub(crate) mod service;

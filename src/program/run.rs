@@ -4,13 +4,16 @@ use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 
 use palpate_realtime::clock::now_ns;
-use palpate_session::run::{RunOptions, run};
+use palpate_session::Session;
+use palpate_session::measure_recorder::MeasureRecorder;
+use palpate_session::run::{RunEvent, RunOptions, run_observed, write_event};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, StageTime, Summary};
 
 use super::indent::{self, IndentArguments};
 use super::scene::{SceneArguments, compile};
+use super::score::{Score, ScoreOptions, ScoreSource};
 use super::{Failure, clock_s, say, with_progress};
 
 #[derive(clap::Args)]
@@ -41,6 +44,12 @@ pub(crate) struct RunArguments {
     /// Measure how long each stage of a step takes: the summary then has `stages`
     #[arg(long)]
     profile: bool,
+    /// Measure what the tools do, and write the score here, as JSON: `measures` has name, value and unit of each figure
+    /// (docs/exercises.md)
+    #[arg(long, value_name = "FILE")]
+    score: Option<PathBuf>,
+    #[command(flatten)]
+    score_options: ScoreOptions,
     /// Show no progress and no summary
     #[arg(short, long)]
     quiet: bool,
@@ -49,7 +58,15 @@ pub(crate) struct RunArguments {
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
+    let options = arguments.score_options.checked()?;
+    if let (None, Some(option)) = (&arguments.score, arguments.score_options.given()) {
+        return Err(Failure::Refused(format!("{option}: goes with --score FILE alone")));
+    }
     if arguments.script.as_os_str() == indent::NAME {
+        if arguments.score.is_some() {
+            let message = format!("--score: goes with a script, not with `{}`", indent::NAME);
+            return Err(Failure::Refused(message));
+        }
         return indent::run(&arguments.indent, &model, &limits, arguments.output.as_deref(), arguments.quiet);
     }
     arguments.indent.refuse_without_indent()?;
@@ -57,11 +74,17 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     for warning in model.warnings.iter().chain(&script.warnings) {
         say!("palpate: warning: {warning}");
     }
+    let mut recorder = match &arguments.score {
+        Some(_) => Some(MeasureRecorder::new(&model, 0, options, (!arguments.held).then_some(&script))?),
+        None => None,
+    };
     let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
     let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
         let profile = arguments.profile.then_some(now_ns as fn() -> u64);
         let options = RunOptions { held: arguments.held, audit: arguments.audit, profile };
-        run(&model, &script, options, &limits, &mut output, &clock_s, progress)
+        let mut observe = |session: &Session| recorder.iter_mut().for_each(|recorder| recorder.see(session));
+        let tell = &mut |event: RunEvent<'_>| write_event(&mut output, progress, event);
+        run_observed(&model, &script, options, &limits, &clock_s, tell, &mut observe)
     });
     let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(SimulationFailure::Output));
     match ended {
@@ -69,6 +92,11 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         Err(SimulationFailure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         Err(failure) => Err(failure.into()),
         Ok(summary) => {
+            if let (Some(path), Some(recorder)) = (&arguments.score, &recorder) {
+                let (scene, script) = (model.scene.name.clone(), Some(script.name.clone()));
+                let source = ScoreSource { scene, script, ..ScoreSource::default() };
+                Score::of(source, model.scene.stepping.rate_hz, recorder.measures()).write(path)?;
+            }
             tell(arguments, &summary);
             for warning in &summary.warnings {
                 say!("palpate: warning: {warning}");

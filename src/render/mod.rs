@@ -5,8 +5,10 @@ mod canvas;
 mod drawn_surface;
 mod film;
 mod picture;
+mod pressed;
 mod surface;
 mod wound;
 
 pub use film::{Film, Gif, Still, gif};
 pub use picture::{Arrow, Camera, LARGEST_SIDE, View, picture};
+pub use pressed::{MAP_COLOURS, STRONG, pressed_map};

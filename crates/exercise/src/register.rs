@@ -52,6 +52,30 @@ mod tests {
     use crate::input::{MeasureOptions, PressedDisc, ToolRow};
     use crate::measures::Measures;
 
+    /// The row of a measure in the guide.
+    fn row(definition: &MeasureDefinition) -> String {
+        let MeasureDefinition { name, unit, scope, range: [least, most], formula, source, .. } = definition;
+        let scope = match scope {
+            crate::Scope::Tool => "tool",
+            crate::Scope::Total => "all",
+            crate::Scope::Both => "both",
+        };
+        let bound = |bound: f64, open: &str| if bound.is_finite() { bound.to_string() } else { open.to_owned() };
+        let formula = formula.replace('|', "\\|");
+        format!(
+            "| `{name}` | {unit} | {scope} | {} … {} | {formula} | {source} |",
+            bound(*least, "−∞"),
+            bound(*most, "∞")
+        )
+    }
+
+    #[test]
+    fn the_guide_has_each_measure_with_its_formula_and_source() {
+        let guide = include_str!("../../../docs/exercises.md");
+        let missing: Vec<String> = definitions().map(row).filter(|row| !guide.contains(row)).collect();
+        assert!(missing.is_empty(), "docs/exercises.md has no such rows:\n{}", missing.join("\n"));
+    }
+
     #[test]
     fn every_measure_has_a_figure_within_its_range_and_no_name_comes_twice() {
         let corner = |x: f64, y: f64| DVec3::new(x, y, 0.0);

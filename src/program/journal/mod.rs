@@ -1,5 +1,6 @@
-//! `palpate journal`: lists, shows, verifies, replays, draws, exports, cuts and recovers journals of sessions.
+//! `palpate journal`: lists, shows, verifies, replays, scores, draws, exports, cuts and recovers journals of sessions.
 
+mod compare;
 mod cut;
 mod draw;
 mod export;
@@ -9,6 +10,7 @@ mod list;
 mod output;
 mod records;
 mod recover;
+mod score;
 mod show;
 mod verify;
 
@@ -44,6 +46,11 @@ enum JournalCommand {
     Verify(verify::VerifyArguments),
     /// Simulate a journal again, and write records as `palpate run` does; or play it on a server
     Replay(records::ReplayArguments),
+    /// Measure what the tools of a session did: time, path, smoothness, force, presses and coverage, as a table, as JSON,
+    /// or as a report to print
+    Score(score::ScoreArguments),
+    /// Compare the figures of several sessions: a learning curve, percentiles, CSV for statistics
+    Compare(compare::CompareArguments),
     /// Draw a session: a PNG image of one moment, or a GIF of all of it
     Render(draw::RenderArguments),
     /// Write places and forces of tools as JSON Lines or CSV, or curves and a moving surface as MCAP for Foxglove
@@ -112,6 +119,8 @@ pub(crate) fn journal(arguments: &JournalArguments) -> Result<(), Failure> {
         JournalCommand::Show(arguments) => show::show(arguments),
         JournalCommand::Verify(arguments) => verify::verify(arguments),
         JournalCommand::Replay(arguments) => records::replay(arguments),
+        JournalCommand::Score(arguments) => score::score(arguments),
+        JournalCommand::Compare(arguments) => compare::compare(arguments),
         JournalCommand::Render(arguments) => draw::render(arguments),
         JournalCommand::Export(arguments) => export::export(arguments),
         JournalCommand::Cut(arguments) => cut::cut(arguments),

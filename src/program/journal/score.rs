@@ -1,0 +1,108 @@
+//! `palpate journal score`: simulates a journal again, and measures what its tools did.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use palpate_exercise::{MeasureOptions, Measures};
+use palpate_session::journal::ReplayEvent;
+use palpate_session::measure_recorder::MeasureRecorder;
+
+use super::super::score::{Score, ScoreOptions, ScoreSource, report};
+use super::super::{Failure, with_progress, write_file};
+use super::JournalSource;
+use super::output::{output, utc, written};
+
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    palpate journal score session.1.mcap\n  \
+    palpate journal score session.1.mcap --force-limit-n 2 --report session.html\n  \
+    palpate journal score session.1.mcap --output session.json\n  \
+    palpate journal compare *.json\n\n\
+    The figures are those of `palpate run … --score` and have the same bits: the journal is simulated again. \
+    docs/exercises.md has the formula and the source of each.\n\n\
+    Exit status: 0; 1 when the simulation differs from the recording, or a file can't be written; 2 when the journal \
+    can't be read, is damaged (the figures then end there), or an option was refused.")]
+pub(super) struct ScoreArguments {
+    #[command(flatten)]
+    source: JournalSource,
+    #[command(flatten)]
+    options: ScoreOptions,
+    /// Print the score as JSON instead of as a table
+    #[arg(long)]
+    json: bool,
+    /// Write the score as JSON to this file, and print nothing
+    #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
+    output: Option<PathBuf>,
+    /// Write a report to print: one page with the force over time, a map of what was pressed, and each figure
+    #[arg(long, value_name = "FILE.html")]
+    report: Option<PathBuf>,
+    /// Show no progress
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+/// What a journal gave.
+pub(super) struct MeasuredJournal {
+    pub(super) score: Score,
+    measures: Measures,
+    /// Where it is damaged, and the last whole step.
+    pub(super) damage: Option<(String, u64)>,
+}
+
+/// Simulates a journal again, and measures it.
+pub(super) fn measure(
+    source: &JournalSource,
+    options: MeasureOptions,
+    quiet: bool,
+) -> Result<MeasuredJournal, Failure> {
+    // Each step is a row, also where the tissue rests.
+    let mut replay = source.replay(None)?.stopping_every(1);
+    let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
+    let mut recorder = MeasureRecorder::new(&model, begin, options, None)?;
+    recorder.see(replay.session());
+    let last = replay.survey().until_step;
+    with_progress("step", last, quiet, |progress| {
+        replay.advance(u64::MAX, &mut |event| {
+            if let ReplayEvent::Step(session) = event {
+                recorder.see(session);
+                if session.step_count().is_multiple_of(1024) {
+                    progress(session.step_count());
+                }
+            }
+            Ok(())
+        })
+    })?;
+    if let Some(difference) = replay.difference() {
+        return Err(Failure::Failed(format!("{}: {difference}", source.file.display())));
+    }
+    let survey = replay.survey();
+    let damage = survey.damage.clone().map(|damage| (damage, survey.until_step));
+    let name = source.file.file_name().map(|name| name.to_string_lossy().into_owned());
+    let of = ScoreSource {
+        scene: model.scene.name.clone(),
+        script: None,
+        journal: name,
+        session_id: Some(replay.header().session_id.clone()),
+        recorded: Some(utc(survey.unix_ns[0])),
+    };
+    let measures = recorder.into_measures();
+    Ok(MeasuredJournal { score: Score::of(of, model.scene.stepping.rate_hz, &measures), measures, damage })
+}
+
+/// Measures a journal, and writes the score.
+pub(super) fn score(arguments: &ScoreArguments) -> Result<(), Failure> {
+    let ScoreArguments { source, options, json, output: file, report: page, quiet } = arguments;
+    let MeasuredJournal { score, measures, damage } = measure(source, options.checked()?, *quiet)?;
+    if let Some(page) = page {
+        write_file(page, report::page(&score, &measures)?.as_bytes())?;
+    }
+    match file {
+        Some(file) => score.write(file)?,
+        None => {
+            let text = if *json { score.json()? } else { score.table() };
+            let mut out = output(None)?;
+            written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))?;
+        }
+    }
+    damage.map_or(Ok(()), |(damage, until_step)| source.tell_damage(Some(&damage), until_step, None))
+}

@@ -1,0 +1,278 @@
+//! A score: the figures of what tools did, as a JSON file and as a table.
+
+pub(crate) mod report;
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+use std::path::Path;
+use std::str::FromStr;
+
+use palpate_exercise::timeline::LimitCrossing;
+use palpate_exercise::{Figure, MeasureOptions, Measures};
+use palpate_refusal::Refusal;
+use palpate_refusal::printable::{printable, printable_json};
+use serde::{Deserialize, Serialize};
+
+use super::{Failure, write_file};
+
+/// Thresholds of measures, and the hands.
+#[derive(clap::Args)]
+pub(crate) struct ScoreOptions {
+    /// The force, N, above which a tool is too strong: the score then has force_above_limit_share, and each time above it
+    #[arg(long, value_name = "N")]
+    force_limit_n: Option<f64>,
+    /// The pressure, Pa, from which a place of the surface counts as covered. Default: 2000, a fingertip 2 mm deep in a
+    /// liver; deep lumps of a breast need 20000
+    #[arg(long, value_name = "PA")]
+    coverage_pa: Option<f64>,
+    /// The force, N, from which a contact counts as a press. Default: 0.1
+    #[arg(long, value_name = "N")]
+    press_n: Option<f64>,
+    /// The tools of one hand, such as the tips of an instrument: give it twice, `--hand 0,1 --hand 2,3`. Default: each of
+    /// two tools is a hand
+    #[arg(long, value_name = "TOOL,…")]
+    hand: Vec<HandTools>,
+}
+
+/// The numbers of the tools of a hand.
+#[derive(Debug, Clone)]
+struct HandTools(Vec<u32>);
+
+impl FromStr for HandTools {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let tools = text.split(',').map(|tool| tool.trim().parse().ok()).collect::<Option<_>>();
+        tools.map(HandTools).ok_or("must be numbers of tools, such as 0,1")
+    }
+}
+
+impl ScoreOptions {
+    /// Returns the thresholds.
+    ///
+    /// # Errors
+    /// Refuses what [`MeasureOptions::check`] refuses, with the option's name.
+    pub(crate) fn checked(&self) -> Result<MeasureOptions, Failure> {
+        let options = MeasureOptions {
+            force_limit_n: self.force_limit_n,
+            coverage_pa: self.coverage_pa.unwrap_or(MeasureOptions::DEFAULT_COVERAGE_PA),
+            press_n: self.press_n.unwrap_or(MeasureOptions::DEFAULT_PRESS_N),
+            hands: self.hand.iter().map(|hand| hand.0.clone()).collect(),
+        };
+        let named = |refusal: Refusal| {
+            let option = if refusal.field == "hands" { "hand".to_owned() } else { refusal.field.replace('_', "-") };
+            Refusal { field: format!("--{option}"), ..refusal }
+        };
+        options.check().map_err(named)?;
+        Ok(options)
+    }
+
+    /// Returns the name of an option that was given; `None` if none was.
+    pub(crate) fn given(&self) -> Option<&'static str> {
+        let given = [
+            ("--force-limit-n", self.force_limit_n.is_some()),
+            ("--coverage-pa", self.coverage_pa.is_some()),
+            ("--press-n", self.press_n.is_some()),
+            ("--hand", !self.hand.is_empty()),
+        ];
+        given.into_iter().find(|(_, is_given)| *is_given).map(|(option, _)| option)
+    }
+}
+
+/// Where a score comes from.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoreSource {
+    /// The scene's name.
+    pub(crate) scene: String,
+    /// The script that was played.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) script: Option<String>,
+    /// The file of the journal that was simulated again.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) journal: Option<String>,
+    /// The recorded session.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) session_id: Option<String>,
+    /// When its recording began, UTC, `2026-01-31 12:34:56.789`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) recorded: Option<String>,
+}
+
+/// The thresholds with which a score was computed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Thresholds {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) force_limit_n: Option<f64>,
+    pub(crate) coverage_pa: f64,
+    pub(crate) press_n: f64,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) hands: Vec<Vec<u32>>,
+}
+
+/// A figure in a score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredMeasure {
+    pub(crate) name: String,
+    pub(crate) value: f64,
+    pub(crate) unit: String,
+    /// The tool; not written for all tools together.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) tool: Option<u32>,
+}
+
+/// A time above the limit of force.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredCrossing {
+    pub(crate) tool: u32,
+    pub(crate) from_step: u64,
+    pub(crate) to_step: u64,
+    pub(crate) from_s: f64,
+    pub(crate) to_s: f64,
+    pub(crate) peak_n: f64,
+}
+
+/// A score, as its JSON file has it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Score {
+    /// The version of Palpate that computed it.
+    pub(crate) version: String,
+    #[serde(flatten)]
+    pub(crate) source: ScoreSource,
+    pub(crate) rate_hz: f64,
+    /// Steps done at the beginning, and since.
+    pub(crate) begin_step: u64,
+    pub(crate) steps: u64,
+    pub(crate) thresholds: Thresholds,
+    /// All tools together, then each tool.
+    pub(crate) measures: Vec<ScoredMeasure>,
+    /// With a limit of force: how often it was exceeded, and the first of these times.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) limit_crossing_count: Option<u64>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) limit_crossings: Vec<ScoredCrossing>,
+}
+
+impl Score {
+    /// Returns the score of what was measured at `rate_hz` steps per second.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn of(source: ScoreSource, rate_hz: f64, measures: &Measures) -> Self {
+        let measure = |Figure { definition, value, tool }: Figure| ScoredMeasure {
+            name: definition.name.to_owned(),
+            value,
+            unit: definition.unit.to_owned(),
+            tool,
+        };
+        let crossing = |crossing: &LimitCrossing| {
+            let LimitCrossing { tool, steps: [from_step, to_step], peak_n } = *crossing;
+            // A row holds for the step that it ends.
+            let from_s = from_step.saturating_sub(1) as f64 / rate_hz;
+            ScoredCrossing { tool, from_step, to_step, from_s, to_s: to_step as f64 / rate_hz, peak_n }
+        };
+        let MeasureOptions { force_limit_n, coverage_pa, press_n, hands } = measures.options().clone();
+        let timeline = measures.timeline();
+        Score {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            source,
+            rate_hz,
+            begin_step: measures.begin_step(),
+            steps: measures.steps(),
+            thresholds: Thresholds { force_limit_n, coverage_pa, press_n, hands },
+            measures: measures.figures().into_iter().map(measure).collect(),
+            limit_crossing_count: force_limit_n.map(|_| timeline.crossing_count()),
+            limit_crossings: timeline.crossings().iter().map(crossing).collect(),
+        }
+    }
+
+    /// Returns the score as the text of a JSON file.
+    pub(crate) fn json(&self) -> Result<String, Failure> {
+        let text = serde_json::to_string_pretty(self).map_err(|e| Failure::Failed(e.to_string()))?;
+        Ok(printable_json(text) + "\n")
+    }
+
+    /// Writes the score as a JSON file.
+    pub(crate) fn write(&self, path: &Path) -> Result<(), Failure> {
+        write_file(path, self.json()?.as_bytes())
+    }
+
+    /// Returns the numbers of the tools, ascending.
+    pub(crate) fn tools(&self) -> Vec<u32> {
+        let tools: BTreeSet<u32> = self.measures.iter().filter_map(|measure| measure.tool).collect();
+        tools.into_iter().collect()
+    }
+
+    /// Returns the value of a measure; `None` if the score has none.
+    pub(crate) fn value(&self, name: &str, tool: Option<u32>) -> Option<f64> {
+        let of = |measure: &&ScoredMeasure| measure.name == name && measure.tool == tool;
+        self.measures.iter().find(of).map(|measure| measure.value)
+    }
+
+    /// Returns the names and units of the measures, each once, in the order of the register.
+    pub(crate) fn names(&self) -> Vec<(&str, &str)> {
+        let has = |name: &str| self.measures.iter().any(|measure| measure.name == name);
+        let definitions = palpate_exercise::register::definitions();
+        definitions.filter(|definition| has(definition.name)).map(|known| (known.name, known.unit)).collect()
+    }
+
+    /// Returns a table for a terminal: a row for each measure, a column for all tools, and one for each tool.
+    pub(crate) fn table(&self) -> String {
+        let tools = self.tools();
+        let mut text = format!("{:<30}{:>14}", "measure", "all tools");
+        tools.iter().for_each(|tool| text += &format!("{:>14}", format!("tool {tool}")));
+        text += "  unit\n";
+        for (name, unit) in self.names() {
+            let _ = write!(text, "{name:<30}{:>14}", shown(self.value(name, None)));
+            tools.iter().for_each(|tool| text += &format!("{:>14}", shown(self.value(name, Some(*tool)))));
+            let _ = writeln!(text, "  {unit}");
+        }
+        for crossing in &self.limit_crossings {
+            let ScoredCrossing { tool, from_s, to_s, peak_n, .. } = crossing;
+            let peak_n = shown(Some(*peak_n));
+            let _ = writeln!(text, "above the limit of force: tool {tool}, {from_s:.3} s to {to_s:.3} s, {peak_n} N");
+        }
+        text
+    }
+
+    /// Returns what the score is of, for people.
+    pub(crate) fn title(&self) -> String {
+        let ScoreSource { scene, script, journal, .. } = &self.source;
+        let of = script.as_ref().or(journal.as_ref());
+        printable(of.map_or_else(|| scene.clone(), |of| format!("{of} on {scene}")))
+    }
+}
+
+/// Returns a value with four digits; a dash if there is none.
+pub(crate) fn shown(value: Option<f64>) -> String {
+    let Some(value) = value else { return "–".to_owned() };
+    match value.abs() {
+        0.0 => "0".to_owned(),
+        size if size >= 10_000.0 => format!("{value:.0}"),
+        size if size >= 0.001 => {
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let digits = (3.0 - size.log10().floor()).max(0.0) as usize;
+            let text = format!("{value:.digits$}");
+            if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+        }
+        _ => format!("{value:.3e}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shown_value_has_four_digits() {
+        for (value, text) in [
+            (0.0, "0"),
+            (1.0, "1"),
+            (0.012_345, "0.01235"),
+            (-5.322_03, "-5.322"),
+            (123.456, "123.5"),
+            (3_612.4, "3612"),
+            (123_456.0, "123456"),
+            (0.000_012_3, "1.230e-5"),
+        ] {
+            assert_eq!(shown(Some(value)), text);
+        }
+    }
+}
