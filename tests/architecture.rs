@@ -7,7 +7,7 @@ use std::process::Command;
 
 /// The crates of more than a few files, and the order of their modules: each may use those before it. `*` is all
 /// others.
-const MODULES: [(&str, &[&str]); 4] = [
+const MODULES: [(&str, &[&str]); 5] = [
     (
         "crates/tissue",
         &[
@@ -31,6 +31,7 @@ const MODULES: [(&str, &[&str]); 4] = [
             "compile",
         ],
     ),
+    ("crates/exercise", &["*"]),
     ("crates/session", &["budget", "*", "surface", "wire", "journal"]),
     ("crates/realtime", &["priority", "ids", "*"]),
     (".", &["server", "render"]),
