@@ -5,10 +5,12 @@ use std::path::PathBuf;
 
 use palpate_refusal::printable::printable_lines;
 use palpate_session::check;
+use palpate_session::exercise_judge::ExerciseJudge;
 use palpate_tissue::Model;
 use palpate_tissue::scene::collection::find_script;
 
-use super::scene::{SceneArguments, compile, compile_with};
+use super::scene::{SceneArguments, compile_with};
+use super::score::exercise::{ChosenExercise, ExerciseOptions};
 use super::{Failure, clock_s, say};
 
 #[derive(clap::Args)]
@@ -17,6 +19,8 @@ pub(crate) struct CheckArguments {
     scene: SceneArguments,
     /// A script to check with it: a file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
     script: Option<PathBuf>,
+    #[command(flatten)]
+    exercise: ExerciseOptions,
 }
 
 /// Fractions of the vertices that are tried, from the smallest change. One vertex less leaves out the worst.
@@ -55,7 +59,13 @@ fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
 
 /// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
-    let (model, limits) = compile(&arguments.scene)?;
+    let chosen = arguments.exercise.chosen()?;
+    let assignments = chosen.as_ref().map(ChosenExercise::assignments).unwrap_or_default();
+    let (model, limits) = compile_with(&arguments.scene, &assignments)?;
+    if let Some(chosen) = &chosen {
+        chosen.warn_of_scene(&model.scene.name);
+        ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
+    }
     let script = arguments.script.as_ref().map(|path| find_script(path, &model.scene, &limits)).transpose()?;
     for warning in script.iter().flat_map(|script| &script.warnings) {
         say!("palpate: warning: {warning}");

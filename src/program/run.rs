@@ -5,15 +5,15 @@ use std::path::PathBuf;
 
 use palpate_realtime::clock::now_ns;
 use palpate_session::Session;
-use palpate_session::measure_recorder::MeasureRecorder;
 use palpate_session::run::{RunEvent, RunOptions, run_observed, write_event};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, StageTime, Summary};
 
 use super::indent::{self, IndentArguments};
-use super::scene::{SceneArguments, compile};
-use super::score::{Score, ScoreOptions, ScoreSource};
+use super::scene::{SceneArguments, compile_with};
+use super::score::exercise::{ChosenExercise, ExerciseOptions};
+use super::score::{ScoreOptions, ScoreRecorder, ScoreSource};
 use super::{Failure, clock_s, say, with_progress};
 
 #[derive(clap::Args)]
@@ -50,6 +50,8 @@ pub(crate) struct RunArguments {
     score: Option<PathBuf>,
     #[command(flatten)]
     score_options: ScoreOptions,
+    #[command(flatten)]
+    exercise: ExerciseOptions,
     /// Show no progress and no summary
     #[arg(short, long)]
     quiet: bool,
@@ -57,7 +59,10 @@ pub(crate) struct RunArguments {
 
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
-    let (model, limits) = compile(&arguments.scene)?;
+    let chosen = arguments.exercise.chosen()?;
+    let assignments = chosen.as_ref().map(ChosenExercise::assignments).unwrap_or_default();
+    let (model, limits) = compile_with(&arguments.scene, &assignments)?;
+    chosen.iter().for_each(|chosen| chosen.warn_of_scene(&model.scene.name));
     let options = arguments.score_options.checked()?;
     if let (None, Some(option)) = (&arguments.score, arguments.score_options.given()) {
         return Err(Failure::Refused(format!("{option}: goes with --score FILE alone")));
@@ -75,14 +80,24 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         say!("palpate: warning: {warning}");
     }
     let mut recorder = match &arguments.score {
-        Some(_) => Some(MeasureRecorder::new(&model, 0, options, (!arguments.held).then_some(&script))?),
+        Some(_) => {
+            let continuous = (!arguments.held).then_some(&script);
+            Some(ScoreRecorder::new(&model, 0, options, continuous, chosen.as_ref())?)
+        }
         None => None,
     };
     let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
     let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
         let profile = arguments.profile.then_some(now_ns as fn() -> u64);
         let options = RunOptions { held: arguments.held, audit: arguments.audit, profile };
-        let mut observe = |session: &Session| recorder.iter_mut().for_each(|recorder| recorder.see(session));
+        let mut observe = |session: &Session| {
+            if let Some(recorder) = &mut recorder {
+                recorder.see(session);
+                if session.step_count() == script.steps {
+                    recorder.finish(session);
+                }
+            }
+        };
         let tell = &mut |event: RunEvent<'_>| write_event(&mut output, progress, event);
         run_observed(&model, &script, options, &limits, &clock_s, tell, &mut observe)
     });
@@ -92,10 +107,10 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         Err(SimulationFailure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         Err(failure) => Err(failure.into()),
         Ok(summary) => {
-            if let (Some(path), Some(recorder)) = (&arguments.score, &recorder) {
+            if let (Some(path), Some(recorder)) = (&arguments.score, recorder) {
                 let (scene, script) = (model.scene.name.clone(), Some(script.name.clone()));
                 let source = ScoreSource { scene, script, ..ScoreSource::default() };
-                Score::of(source, model.scene.stepping.rate_hz, recorder.measures()).write(path)?;
+                recorder.into_score(source, model.scene.stepping.rate_hz).0.write(path)?;
             }
             tell(arguments, &summary);
             for warning in &summary.warnings {

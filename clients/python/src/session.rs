@@ -11,7 +11,7 @@ use palpate_session::simulation::Simulation;
 use palpate_session::snapshot::Saved;
 use palpate_tissue::Model;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::script::{Action, Mark};
+use palpate_tissue::scene::script::{Action, PlaceMark};
 use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::scene::{self, Change};
 use palpate_tissue::shape::PointId;
@@ -296,7 +296,7 @@ impl Session {
     #[pyo3(signature = (tool, place_m, *, diameter_m=None))]
     fn mark(&self, py: Python<'_>, tool: u32, place_m: &Bound<'_, PyAny>, diameter_m: Option<f64>) -> PyResult<()> {
         let place_m = vector("place_m", place_m)?;
-        self.submit(py, tool, Action::Mark(Mark { place_m, diameter_m }))
+        self.submit(py, tool, Action::Mark(PlaceMark { place_m, diameter_m }))
     }
 
     /// Cuts a thread or clip, and takes it out.

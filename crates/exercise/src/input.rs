@@ -42,6 +42,9 @@ pub struct MeasureOptions {
     pub coverage_pa: f64,
     /// The force, N, from which a contact counts as a press ([`DEFAULT_PRESS_N`](Self::DEFAULT_PRESS_N)).
     pub press_n: f64,
+    /// The direction, of length 1, along which somebody looks at the surface: only the part of it that faces this within 60° counts for
+    /// coverage. `None`: all of it.
+    pub seen_along: Option<DVec3>,
     /// The tools of each hand. Empty: each tool is a hand of its own.
     pub hands: Vec<Vec<u32>>,
 }
@@ -85,6 +88,7 @@ impl Default for MeasureOptions {
             force_limit_n: None,
             coverage_pa: Self::DEFAULT_COVERAGE_PA,
             press_n: Self::DEFAULT_PRESS_N,
+            seen_along: None,
             hands: Vec::new(),
         }
     }

@@ -1,9 +1,9 @@
 //! The register: all measures, in the order in which they are told.
 
 use crate::definition::MeasureDefinition;
-use crate::{coverage, detection, force, hands, jerk, path, press, sparc, time};
+use crate::{answers, coverage, detection, force, hands, incision, jerk, path, press, sparc, tasks, time};
 
-const DEFINITIONS: [&MeasureDefinition; 25] = [
+const DEFINITIONS: [&MeasureDefinition; 40] = [
     &time::TIME,
     &time::CONTACT_TIME,
     &time::IDLE_TIME,
@@ -28,13 +28,36 @@ const DEFINITIONS: [&MeasureDefinition; 25] = [
     &hands::BIMANUAL_IDLE,
     &coverage::COVERAGE,
     &coverage::COVERED_AREA,
+    &answers::HITS,
+    &answers::MISSES,
+    &answers::HITS_SHARE,
+    &answers::FALSE_ALARMS,
     &detection::D_PRIME,
+    &answers::PLACE_ERROR,
+    &answers::SIZE_ERROR,
+    &incision::LINE_CUT_SHARE,
+    &incision::LINE_ERROR,
+    &incision::OFF_LINE_SHARE,
+    &incision::GAPE,
+    &incision::STITCHES,
+    &tasks::AVOIDED_CONTACT,
+    &tasks::AVOIDED_FORCE,
+    &tasks::LIFT_HEIGHT,
+    &tasks::HELD_SHARE,
 ];
 
-/// Returns the definitions of all measures. `d_prime` needs the truth of an exercise; [`Measures`](crate::Measures) does
-/// not give it.
+/// The first of the measures that need the truth of an exercise: they follow those that need none.
+const FIRST_OF_TRUTH: usize = 24;
+
+/// Returns the definitions of all measures. [`Measures`](crate::Measures) gives the first of them, and
+/// [`ExerciseTruth`](crate::ExerciseTruth) those that need the truth of an exercise ([`needs_truth`]).
 pub fn definitions() -> impl Iterator<Item = &'static MeasureDefinition> {
     DEFINITIONS.into_iter()
+}
+
+/// Returns whether a measure needs the truth of an exercise.
+pub fn needs_truth(definition: &MeasureDefinition) -> bool {
+    DEFINITIONS[FIRST_OF_TRUTH..].iter().any(|of_truth| of_truth.name == definition.name)
 }
 
 /// Returns the measure of a name; `None` if there is none.
@@ -97,7 +120,9 @@ mod tests {
             }
             measures.step(&rows);
         }
-        let mut told = BTreeSet::from(["d_prime"]);
+        let mut told: BTreeSet<&str> =
+            definitions().filter(|definition| needs_truth(definition)).map(|definition| definition.name).collect();
+        assert!(told.len() == 16 && told.contains("d_prime") && !told.contains("work_j"), "{told:?}");
         for figure in measures.figures() {
             let MeasureDefinition { name, scope, range: [least, most], .. } = figure.definition;
             assert!((*least..=*most).contains(&figure.value), "{name}: {}", figure.value);

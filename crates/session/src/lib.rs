@@ -19,6 +19,7 @@ pub mod budget;
 pub mod check;
 pub mod command;
 pub mod current_laws;
+pub mod exercise_judge;
 pub mod indentation;
 pub mod input;
 pub mod intake;
@@ -52,7 +53,7 @@ use palpate_haptics::{LocalModel, MotionState, OtherTool, Tip};
 use palpate_tissue::memory;
 use palpate_tissue::scene::profile::{LoadProfile, MotionProfile, Poke};
 use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
-use palpate_tissue::scene::script::{Action, Mark};
+use palpate_tissue::scene::script::{Action, PlaceMark};
 use palpate_tissue::select::audit::{Mark, WindowInputs};
 use palpate_tissue::shape::{self, PointId, PointName};
 use palpate_tissue::{self as tissue, BlowUp, Energy, Grasp, Model, PointState, Push, ReadCopy, Tissue, ToolContact};
@@ -213,18 +214,18 @@ pub struct Session {
     path_counts: [u64; 3],
     recoveries: Recoveries,
     hold_reason: Option<String>,
-    marks: Vec<PlacedMark>,
+    marks: Vec<RecordedMark>,
 }
 
 /// A place that somebody marked on the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlacedMark {
+pub struct RecordedMark {
     /// Number of steps done when it was made.
     pub step: u64,
     /// The tool whose holder made it.
     pub tool: u32,
     /// The mark.
-    pub mark: Mark,
+    pub mark: PlaceMark,
 }
 
 /// Largest number of marks that a session keeps.
@@ -302,7 +303,7 @@ impl Session {
     }
 
     /// Returns the marks that were made since the session began or continued, in their order: at most 1024, further ones are ignored.
-    pub fn marks(&self) -> &[PlacedMark] {
+    pub fn marks(&self) -> &[RecordedMark] {
         &self.marks
     }
 
@@ -524,7 +525,7 @@ impl Session {
             // The tissue and the tool stay as they are.
             tool.late = late;
             if let (Action::Mark(mark), true) = (command.action.with_unsigned_zeros(), self.marks.len() < MAX_MARKS) {
-                self.marks.push(PlacedMark { step, tool: command.tool, mark });
+                self.marks.push(RecordedMark { step, tool: command.tool, mark });
             }
             return;
         }

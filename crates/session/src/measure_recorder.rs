@@ -31,8 +31,9 @@ impl MeasureRecorder {
     /// Returns the refusals of [`MeasureOptions::check`].
     pub fn new(model: &Model, begin_step: u64, options: MeasureOptions, continuous: Option<&Script>) -> Result<Self> {
         options.check()?;
+        let seen_along = options.seen_along;
         let rate_hz = model.scene.stepping.rate_hz;
-        let measures = Measures::new(rate_hz, begin_step, options, surface_m(model.shape()).into_iter());
+        let measures = Measures::new(rate_hz, begin_step, options, surface_m(model.shape(), seen_along).into_iter());
         Ok(MeasureRecorder { measures, continuous: continuous.cloned(), newest: begin_step, rows: Vec::new() })
     }
 
@@ -51,6 +52,11 @@ impl MeasureRecorder {
         self.collect(session);
         self.measures.step(&self.rows);
         self.newest = step;
+    }
+
+    /// Returns the rows of the tools at the newest step.
+    pub fn rows(&self) -> &[ToolRow] {
+        &self.rows
     }
 
     /// Returns the measures so far.
@@ -97,8 +103,22 @@ impl MeasureRecorder {
     }
 }
 
-/// Returns the triangles of the surface at rest, m: those whose corners are points, or else those that frames show.
-fn surface_m(shape: &dyn RestShape) -> Vec<[DVec3; 3]> {
+/// The cosine of the angle up to which a triangle faces who looks at it: 60°.
+const FACES: f64 = 0.5;
+
+/// Returns the triangles of the surface at rest, m: those whose corners are points, or else those that frames show; of these the ones
+/// that face against `seen_along`, or all.
+fn surface_m(shape: &dyn RestShape, seen_along: Option<DVec3>) -> Vec<[DVec3; 3]> {
+    let mut triangles_m = all_triangles_m(shape);
+    if let Some(seen_along) = seen_along {
+        let normal = |[a, b, c]: &[DVec3; 3]| (*b - *a).cross(*c - *a).normalize_or_zero();
+        triangles_m.retain(|corners_m| normal(corners_m).dot(seen_along) <= -FACES);
+    }
+    triangles_m
+}
+
+/// Returns all triangles of the surface at rest, m.
+fn all_triangles_m(shape: &dyn RestShape) -> Vec<[DVec3; 3]> {
     let of_points = shape.triangles();
     if !of_points.is_empty() {
         let rest_m = |corner: u32| shape.rest_m(PointId::new(corner as usize));

@@ -8,7 +8,9 @@ use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::rigid_tip_work;
 use palpate_tissue::scene::Scene;
-use palpate_tissue::scene::action_check::{self, check_free, check_mark, check_poke, check_reach, check_tie, check_tie_number};
+use palpate_tissue::scene::action_check::{
+    self, check_free, check_mark, check_poke, check_reach, check_tie, check_tie_number,
+};
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
 

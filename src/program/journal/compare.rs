@@ -168,7 +168,7 @@ pub(super) fn compare(arguments: &CompareArguments) -> Result<(), Failure> {
     for path in files {
         let score = if is_journal(path) {
             let source = JournalSource { file: path.clone(), config: config.clone() };
-            let MeasuredJournal { score, damage, .. } = measure(&source, options.clone(), *quiet)?;
+            let MeasuredJournal { score, damage, .. } = measure(&source, options.clone(), None, *quiet)?;
             if let Some((damage, until_step)) = damage {
                 say!("palpate: warning: {}: {damage}; its figures end at step {until_step}", path.display());
             }

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 
 use palpate_exercise::{MeasureOptions, Measures};
 use palpate_session::journal::ReplayEvent;
-use palpate_session::measure_recorder::MeasureRecorder;
 
-use super::super::score::{Score, ScoreOptions, ScoreSource, report};
+use super::super::score::exercise::{ChosenExercise, ExerciseOptions};
+use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
 use super::output::{output, utc, written};
@@ -27,6 +27,8 @@ pub(super) struct ScoreArguments {
     source: JournalSource,
     #[command(flatten)]
     options: ScoreOptions,
+    #[command(flatten)]
+    exercise: ExerciseOptions,
     /// Print the score as JSON instead of as a table
     #[arg(long)]
     json: bool,
@@ -53,12 +55,14 @@ pub(super) struct MeasuredJournal {
 pub(super) fn measure(
     source: &JournalSource,
     options: MeasureOptions,
+    chosen: Option<&ChosenExercise>,
     quiet: bool,
 ) -> Result<MeasuredJournal, Failure> {
     // Each step is a row, also where the tissue rests.
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
-    let mut recorder = MeasureRecorder::new(&model, begin, options, None)?;
+    chosen.iter().for_each(|chosen| chosen.warn_of_scene(&model.scene.name));
+    let mut recorder = ScoreRecorder::new(&model, begin, options, None, chosen)?;
     recorder.see(replay.session());
     let last = replay.survey().until_step;
     with_progress("step", last, quiet, |progress| {
@@ -85,14 +89,16 @@ pub(super) fn measure(
         session_id: Some(replay.header().session_id.clone()),
         recorded: Some(utc(survey.unix_ns[0])),
     };
-    let measures = recorder.into_measures();
-    Ok(MeasuredJournal { score: Score::of(of, model.scene.stepping.rate_hz, &measures), measures, damage })
+    recorder.finish(replay.session());
+    let (score, measures) = recorder.into_score(of, model.scene.stepping.rate_hz);
+    Ok(MeasuredJournal { score, measures, damage })
 }
 
 /// Measures a journal, and writes the score.
 pub(super) fn score(arguments: &ScoreArguments) -> Result<(), Failure> {
-    let ScoreArguments { source, options, json, output: file, report: page, quiet } = arguments;
-    let MeasuredJournal { score, measures, damage } = measure(source, options.checked()?, *quiet)?;
+    let ScoreArguments { source, options, exercise, json, output: file, report: page, quiet } = arguments;
+    let MeasuredJournal { score, measures, damage } =
+        measure(source, options.checked()?, exercise.chosen()?.as_ref(), *quiet)?;
     if let Some(page) = page {
         write_file(page, report::page(&score, &measures)?.as_bytes())?;
     }

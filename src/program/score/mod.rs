@@ -1,5 +1,6 @@
 //! A score: the figures of what tools did, as a JSON file and as a table.
 
+pub(crate) mod exercise;
 pub(crate) mod report;
 
 use std::collections::BTreeSet;
@@ -13,7 +14,14 @@ use palpate_refusal::Refusal;
 use palpate_refusal::printable::{printable, printable_json};
 use serde::{Deserialize, Serialize};
 
+use palpate_session::Session;
+use palpate_session::exercise_judge::{ExerciseJudge, with_limits};
+use palpate_session::measure_recorder::MeasureRecorder;
+use palpate_tissue::Model;
+use palpate_tissue::scene::script::Script;
+
 use super::{Failure, write_file};
+use exercise::{ChosenExercise, ScoredExercise};
 
 /// Thresholds of measures, and the hands.
 #[derive(clap::Args)]
@@ -58,6 +66,7 @@ impl ScoreOptions {
             coverage_pa: self.coverage_pa.unwrap_or(MeasureOptions::DEFAULT_COVERAGE_PA),
             press_n: self.press_n.unwrap_or(MeasureOptions::DEFAULT_PRESS_N),
             hands: self.hand.iter().map(|hand| hand.0.clone()).collect(),
+            seen_along: None,
         };
         let named = |refusal: Refusal| {
             let option = if refusal.field == "hands" { "hand".to_owned() } else { refusal.field.replace('_', "-") };
@@ -150,12 +159,80 @@ pub(crate) struct Score {
     pub(crate) limit_crossing_count: Option<u64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) limit_crossings: Vec<ScoredCrossing>,
+    /// The exercise, if there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) exercise: Option<ScoredExercise>,
+}
+
+/// Measures a session, and judges it by an exercise if there is one.
+pub(crate) struct ScoreRecorder {
+    recorder: MeasureRecorder,
+    judge: Option<(ExerciseJudge, u64)>,
+    /// What the end of the session has shown.
+    judged: Option<(Vec<Figure>, ScoredExercise)>,
+}
+
+impl ScoreRecorder {
+    /// Begins at step `begin_step`; `continuous` is as for [`MeasureRecorder::new`].
+    ///
+    /// # Errors
+    /// Refuses what [`MeasureRecorder::new`] and [`ExerciseJudge::new`] refuse.
+    pub(crate) fn new(
+        model: &Model,
+        begin_step: u64,
+        options: MeasureOptions,
+        continuous: Option<&Script>,
+        chosen: Option<&ChosenExercise>,
+    ) -> Result<Self, Refusal> {
+        let options = chosen.map_or(options.clone(), |chosen| with_limits(&chosen.exercise, options));
+        let judge = |chosen: &ChosenExercise| {
+            let judge = ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), model, begin_step)?;
+            Ok::<_, Refusal>((judge, chosen.seed))
+        };
+        Ok(ScoreRecorder {
+            recorder: MeasureRecorder::new(model, begin_step, options, continuous)?,
+            judge: chosen.map(judge).transpose()?,
+            judged: None,
+        })
+    }
+
+    /// Takes the session at its present step. When the time of the exercise is up, judges it; what comes later does not count.
+    pub(crate) fn see(&mut self, session: &Session) {
+        if self.judged.is_some() {
+            return;
+        }
+        self.recorder.see(session);
+        if let Some((judge, _)) = &mut self.judge {
+            judge.see(session, self.recorder.rows());
+            if judge.is_time_up(session) {
+                self.finish(session);
+            }
+        }
+    }
+
+    /// Judges the session at its end.
+    pub(crate) fn finish(&mut self, session: &Session) {
+        if let (Some((judge, seed)), None) = (&self.judge, &self.judged) {
+            let of_truth = judge.figures(session);
+            let mut figures = self.recorder.measures().figures();
+            figures.extend(&of_truth);
+            self.judged = Some((of_truth, ScoredExercise::of(judge, *seed, session, &figures)));
+        }
+    }
+
+    /// Returns the score and the measures.
+    pub(crate) fn into_score(self, source: ScoreSource, rate_hz: f64) -> (Score, Measures) {
+        let measures = self.recorder.into_measures();
+        let (of_truth, exercise) = self.judged.unzip();
+        let score = Score::of(source, rate_hz, &measures, &of_truth.unwrap_or_default());
+        (Score { exercise, ..score }, measures)
+    }
 }
 
 impl Score {
-    /// Returns the score of what was measured at `rate_hz` steps per second.
+    /// Returns the score of what was measured at `rate_hz` steps per second, with the figures that need the truth of an exercise.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn of(source: ScoreSource, rate_hz: f64, measures: &Measures) -> Self {
+    fn of(source: ScoreSource, rate_hz: f64, measures: &Measures, of_truth: &[Figure]) -> Self {
         let measure = |Figure { definition, value, tool }: Figure| ScoredMeasure {
             name: definition.name.to_owned(),
             value,
@@ -168,7 +245,7 @@ impl Score {
             let from_s = from_step.saturating_sub(1) as f64 / rate_hz;
             ScoredCrossing { tool, from_step, to_step, from_s, to_s: to_step as f64 / rate_hz, peak_n }
         };
-        let MeasureOptions { force_limit_n, coverage_pa, press_n, hands } = measures.options().clone();
+        let MeasureOptions { force_limit_n, coverage_pa, press_n, hands, .. } = measures.options().clone();
         let timeline = measures.timeline();
         Score {
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -177,9 +254,10 @@ impl Score {
             begin_step: measures.begin_step(),
             steps: measures.steps(),
             thresholds: Thresholds { force_limit_n, coverage_pa, press_n, hands },
-            measures: measures.figures().into_iter().map(measure).collect(),
+            measures: measures.figures().into_iter().chain(of_truth.iter().copied()).map(measure).collect(),
             limit_crossing_count: force_limit_n.map(|_| timeline.crossing_count()),
             limit_crossings: timeline.crossings().iter().map(crossing).collect(),
+            exercise: None,
         }
     }
 
@@ -223,6 +301,18 @@ impl Score {
             let _ = write!(text, "{name:<30}{:>14}", shown(self.value(name, None)));
             tools.iter().for_each(|tool| text += &format!("{:>14}", shown(self.value(name, Some(*tool)))));
             let _ = writeln!(text, "  {unit}");
+        }
+        if let Some(ScoredExercise { name, seed, score_percent, criteria, .. }) = &self.exercise {
+            let percent = score_percent.map_or("–".to_owned(), |percent| format!("{percent:.1} %"));
+            let _ = writeln!(text, "exercise {}, seed {seed}: {percent}", printable(name));
+            for criterion in criteria {
+                let (value, earned) = (shown(criterion.value), 100.0 * criterion.earned);
+                let _ = writeln!(
+                    text,
+                    "  {:<28}{value:>14}  {earned:>5.1} % of weight {}",
+                    criterion.measure, criterion.weight
+                );
+            }
         }
         for crossing in &self.limit_crossings {
             let ScoredCrossing { tool, from_s, to_s, peak_n, .. } = crossing;

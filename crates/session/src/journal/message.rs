@@ -21,7 +21,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::saved::{CorrectedPlan, SavedPlan};
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::script::{Action, Mark};
+use palpate_tissue::scene::script::{Action, PlaceMark};
 use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::scene::{Appearance, Integrator, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
@@ -282,7 +282,7 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
             })
         }
         Action::Tie { number, tie } => Message::Tie(of_tie(*number, tie.as_ref())),
-        Action::Mark(Mark { place_m, diameter_m }) => {
+        Action::Mark(PlaceMark { place_m, diameter_m }) => {
             Message::Mark(pb::Mark { place_m: vector(*place_m), diameter_m: *diameter_m })
         }
         Action::Release => Message::Release(pb::Release {}),
@@ -390,7 +390,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
         }
         Message::Tie(message) => Action::Tie { number: message.number, tie: from_tie(message) },
         Message::Mark(pb::Mark { place_m, diameter_m }) => {
-            Action::Mark(Mark { place_m: from_vector(place_m.as_ref()), diameter_m: *diameter_m })
+            Action::Mark(PlaceMark { place_m: from_vector(place_m.as_ref()), diameter_m: *diameter_m })
         }
         Message::Release(_) => Action::Release,
     };

@@ -10,7 +10,7 @@ use super::{from_point, point, required};
 use crate::command::Command;
 use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::script::{Action, Mark};
+use palpate_tissue::scene::script::{Action, PlaceMark};
 use palpate_tissue::scene::tie::{Bite, Tie, TieKind};
 use palpate_tissue::shape::{PointId, RestShape};
 
@@ -60,7 +60,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
         Message::Tie(message) => Action::Tie { number: message.number, tie: from_tie(shape, message)? },
         Message::Mark(pb::Mark { place_m, diameter_m }) => {
             let place_m = from_vector(Some(required("mark.place_m", place_m.as_ref())?));
-            Action::Mark(Mark { place_m: shape.in_rest_space_m(place_m), diameter_m: *diameter_m })
+            Action::Mark(PlaceMark { place_m: shape.in_rest_space_m(place_m), diameter_m: *diameter_m })
         }
         Message::Release(_) => Action::Release,
         Message::Instrument(_) => {
@@ -188,7 +188,7 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
             Message::Pose(pb::Pose { velocity_m_per_s: velocity_m_per_s.and_then(vector), ..pose(*place_m, tip) })
         }
         Action::Tie { number, tie: laid } => Message::Tie(tie(*number, laid.as_ref())),
-        Action::Mark(Mark { place_m, diameter_m }) => {
+        Action::Mark(PlaceMark { place_m, diameter_m }) => {
             Message::Mark(pb::Mark { place_m: vector(*place_m), diameter_m: *diameter_m })
         }
         Action::Release => Message::Release(pb::Release {}),

@@ -9,7 +9,7 @@ use palpate_haptics::Tip;
 
 /// A place that a person marks on the surface: what they look for is there, or below it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Mark {
+pub struct PlaceMark {
     /// The place, m, in the tissue's frame.
     pub place_m: DVec3,
     /// The diameter that they think it has, m; `None` if they don't say.
@@ -49,7 +49,7 @@ pub enum Action {
         tie: Option<Tie>,
     },
     /// Marks a place of the surface, as an answer in an exercise: it changes nothing, and what the tool does goes on.
-    Mark(Mark),
+    Mark(PlaceMark),
     /// Ends the tool's action: it no longer pushes, grasps or touches.
     Release,
 }

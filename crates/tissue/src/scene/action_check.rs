@@ -3,7 +3,7 @@
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip, TipShape};
 
-use super::action::Mark;
+use super::action::PlaceMark;
 use super::profile::Poke;
 use super::tie::{Bite, MAX_BITES, Tie, TieKind};
 use crate::limits::Limits;
@@ -200,7 +200,7 @@ pub fn check_tie(field: &str, shape: &dyn RestShape, tie: &Tie, limits: &Limits)
 ///
 /// # Errors
 /// Refuses a place off the tissue ([`Reason::OffTissue`]), and a diameter that is not above 0 or longer than the tissue's longest side.
-pub fn check_mark(field: &str, shape: &dyn RestShape, mark: &Mark) -> Result<()> {
+pub fn check_mark(field: &str, shape: &dyn RestShape, mark: &PlaceMark) -> Result<()> {
     finite_vector(&format!("{field}.place_m"), mark.place_m)?;
     shape.check_place(&format!("{field}.place_m"), mark.place_m)?;
     let Some(diameter_m) = mark.diameter_m else { return Ok(()) };

@@ -14,7 +14,7 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("palpate-all", include_str!("../../../../exercises/palpate-all.toml")),
 ];
 
-/// Largest number of lumps, lines, regions to avoid, phases and criteria of an exercise, each.
+/// Largest number of lumps, lines, regions to avoid and criteria of an exercise, each.
 pub const MAX_PARTS: usize = 64;
 
 /// How often a lump is placed anew before the exercise is refused: its box has no room for another one.
@@ -33,7 +33,7 @@ pub struct Exercise {
     pub scenes: Vec<String>,
     /// The seed of its hidden truth if nothing else gives one.
     pub seed: u64,
-    /// The time that the trainee has, s; `None`: as long as it takes.
+    /// The time that the trainee has, s: what is done later does not count. `None`: as long as it takes.
     pub time_limit_s: Option<f64>,
     /// The direction along which the trainee looks at the surface, of length 1. Distances along it do not count: an answer is on the
     /// surface and the lump below it, and a cut is deeper than its line.
@@ -48,14 +48,10 @@ pub struct Exercise {
     pub lift: Option<LiftTask>,
     /// How the surface must be pressed for a part of it to count as felt.
     pub coverage: Option<CoverageTask>,
-    /// The phases, by ascending beginning; empty: one, the whole time.
-    pub phases: Vec<ExercisePhase>,
     /// The values that the trainee must stay below.
     pub limits: ExerciseLimits,
     /// How the measures become a score.
     pub criteria: Vec<Criterion>,
-    /// What a trainee may see during the exercise.
-    pub shows: Vec<ShownValue>,
 }
 
 /// Lumps that are drawn from a seed. Ranges are [least, most], both included.
@@ -124,22 +120,11 @@ pub struct CoverageTask {
     pub pressure_pa: f64,
 }
 
-/// A part of an exercise's time.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ExercisePhase {
-    /// What it is called.
-    pub name: String,
-    /// Its beginning, s; it lasts until the next begins.
-    pub from_s: f64,
-}
-
 /// Values that the trainee must stay below; `None`: no limit.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ExerciseLimits {
     /// Force of one tool, N.
     pub force_n: Option<f64>,
-    /// Mean pressure under a tip, Pa.
-    pub pressure_pa: Option<f64>,
 }
 
 /// A measure in a score.
@@ -153,34 +138,6 @@ pub struct Criterion {
     pub poor: f64,
     /// The value that earns all. Between both the points are in proportion.
     pub good: f64,
-}
-
-/// What a trainee may see during an exercise.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ShownValue {
-    /// The time that is left.
-    Time,
-    /// The force on the tools.
-    Force,
-    /// The measures, ten times a second.
-    Measures,
-    /// The score at the end.
-    Score,
-}
-
-impl ShownValue {
-    /// All of them.
-    pub const ALL: [Self; 4] = [ShownValue::Time, ShownValue::Force, ShownValue::Measures, ShownValue::Score];
-
-    /// Returns the name in files.
-    pub fn name(self) -> &'static str {
-        match self {
-            ShownValue::Time => "time",
-            ShownValue::Force => "force",
-            ShownValue::Measures => "measures",
-            ShownValue::Score => "score",
-        }
-    }
 }
 
 impl Criterion {

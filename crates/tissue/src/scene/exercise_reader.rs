@@ -4,8 +4,7 @@ use glam::DVec3;
 
 use super::collection::{Collection, is_name, name_in};
 use super::exercise::{
-    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, ExercisePhase, HiddenLumps, LiftTask,
-    MAX_PARTS, ShownValue,
+    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, HiddenLumps, LiftTask, MAX_PARTS,
 };
 use super::kind::TextKind;
 use super::toml_document::{Document, Fields, Item};
@@ -38,7 +37,7 @@ impl Exercise {
     ///
     /// # Errors
     /// Refuses a text that is not TOML, a scene or a script, unknown and missing keys, values of the wrong kind or out of range, an
-    /// exercise without a scene, phases that don't ascend, names of criteria that occur twice, and lumps that have no room in their box.
+    /// exercise without a scene, names of criteria that occur twice, and lumps that have no room in their box.
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let document = Document::parse(name, text)?;
         TextKind::Exercise.check(&document)?;
@@ -65,10 +64,8 @@ fn read(fields: &mut Fields<'_>) -> Result<Exercise> {
         avoid: parts(fields, "avoid")?.iter().map(|item| item.table(avoided)).collect::<Result<_>>()?,
         lift: fields.item("lift").map(|item| item.table(lift)).transpose()?,
         coverage: fields.item("coverage").map(|item| item.table(coverage)).transpose()?,
-        phases: phases(fields)?,
         limits: fields.item("limits").map_or(Ok(ExerciseLimits::default()), |item| item.table(limits))?,
         criteria: criteria(fields)?,
-        shows: shows(fields)?,
     };
     if exercise.lumps(exercise.seed).is_none() {
         let message = "have no room in the box from `from_m` to `to_m`: make it larger, or the lumps fewer, smaller or less apart";
@@ -200,22 +197,7 @@ fn coverage(fields: &mut Fields<'_>) -> Result<CoverageTask> {
 }
 
 fn limits(fields: &mut Fields<'_>) -> Result<ExerciseLimits> {
-    Ok(ExerciseLimits {
-        force_n: positive_or_none(fields, "force_n")?,
-        pressure_pa: positive_or_none(fields, "pressure_pa")?,
-    })
-}
-
-fn phases(fields: &mut Fields<'_>) -> Result<Vec<ExercisePhase>> {
-    let phase = |fields: &mut Fields<'_>| {
-        Ok(ExercisePhase { name: fields.required("name")?.text()?, from_s: distance(fields, "from_s", 0.0)? })
-    };
-    let phases = parts(fields, "phase")?.iter().map(|item| item.table(phase)).collect::<Result<Vec<_>>>()?;
-    if let Some(index) = phases.windows(2).position(|pair| pair[1].from_s <= pair[0].from_s) {
-        let message = format!("{} must begin after the one before it", index + 1);
-        return Err(fields.refuse(Reason::OutOfRange, "phase", message));
-    }
-    Ok(phases)
+    Ok(ExerciseLimits { force_n: positive_or_none(fields, "force_n")? })
 }
 
 fn criteria(fields: &mut Fields<'_>) -> Result<Vec<Criterion>> {
@@ -237,16 +219,6 @@ fn criteria(fields: &mut Fields<'_>) -> Result<Vec<Criterion>> {
         }
     }
     Ok(criteria)
-}
-
-fn shows(fields: &mut Fields<'_>) -> Result<Vec<ShownValue>> {
-    let Some(item) = fields.item("shows") else { return Ok(ShownValue::ALL.to_vec()) };
-    let value = |item: &Item<'_>| {
-        let name = item.text()?;
-        let value = ShownValue::ALL.into_iter().find(|value| value.name() == name);
-        value.ok_or_else(|| item.wrong(&format!("one of {}", ShownValue::ALL.map(ShownValue::name).join(", "))))
-    };
-    item.list()?.iter().map(value).collect()
 }
 
 #[cfg(test)]
@@ -322,11 +294,6 @@ apart_m = 0.01
             ("scenes = [\"phantom\"]", "scenes = []", "mine.toml:4: scenes: must name at least one scene"),
             ("scenes = [\"phantom\"]", "", "mine.toml:1: scenes: is missing"),
             ("name = \"mine\"", "name = \"my own\"", "mine.toml:2: name: must have letters"),
-            (
-                "[lumps]",
-                "shows = [\"all\"]\n[lumps]",
-                "mine.toml:5: shows[0]: must be one of time, force, measures, score",
-            ),
             (
                 "[lumps]",
                 "[[criterion]]\nmeasure = \"time_s\"\npoor = 1\ngood = 1\n[lumps]",

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::Change;
-pub use super::action::{Action, Mark};
+pub use super::action::{Action, PlaceMark};
 use super::profile::{InstrumentProfile, LoadProfile, Moment, MotionProfile, PoseProfile, TieProfile};
 use super::record::{ContactRecord, InstrumentRecord, PortRecord, ToolRecord};
 use crate::shape::{PointId, RestShape};
@@ -70,7 +70,7 @@ pub struct Script {
     pub ties: Vec<TieProfile>,
     /// Marks, each with the step at whose beginning it is made, in the order of the text. The tool that lays threads and clips makes
     /// them.
-    pub marks: Vec<(u64, Mark)>,
+    pub marks: Vec<(u64, PlaceMark)>,
     /// Changes of the tissue, each with the step at whose beginning it takes effect, by strictly ascending
     /// step.
     pub changes: Vec<(u64, Change)>,

@@ -11,7 +11,7 @@ use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Port, Tip, TipShape};
 
-use super::action::Mark;
+use super::action::PlaceMark;
 use super::kind::TextKind;
 use super::profile::{
     CentreProfile, InstrumentProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile,
@@ -615,14 +615,14 @@ impl Binding<'_> {
     }
 
     /// Reads the marks that a trainee makes.
-    fn marks(&mut self, fields: &mut Fields<'_>) -> Result<Vec<(u64, Mark)>> {
+    fn marks(&mut self, fields: &mut Fields<'_>) -> Result<Vec<(u64, PlaceMark)>> {
         let mut marks = Vec::new();
         for item in items(fields, "mark")? {
             marks.push(item.table(|fields| {
                 let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
                 let step = self.steps(&fields.path("at_s"), at_s)?;
                 let place_m = fields.required("place_m")?.place_in(self.scene.shape().dimensions())?;
-                let mark = Mark { place_m, diameter_m: fields.number("diameter_m")? };
+                let mark = PlaceMark { place_m, diameter_m: fields.number("diameter_m")? };
                 check_mark(fields.own_path(), self.scene.shape(), &mark)?;
                 Ok((step, mark))
             })?);

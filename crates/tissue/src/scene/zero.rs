@@ -9,7 +9,7 @@
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};
 
-use super::action::Mark;
+use super::action::PlaceMark;
 use super::profile::Poke;
 use super::script::Action;
 use super::tie::{Bite, Tie, TieKind};
@@ -107,7 +107,7 @@ impl Action {
                 Action::Pose { place_m: unsigned(place_m), velocity_m_per_s, tip }
             }
             Action::Tie { number, tie } => Action::Tie { number, tie: tie.map(unsigned_tie) },
-            Action::Mark(mark) => Action::Mark(Mark { place_m: unsigned(mark.place_m), ..mark }),
+            Action::Mark(mark) => Action::Mark(PlaceMark { place_m: unsigned(mark.place_m), ..mark }),
             Action::Release => Action::Release,
         }
     }

@@ -1,0 +1,195 @@
+//! An exercise while it is done: its hidden truth, and how what the trainee does is judged by it.
+
+use glam::DVec3;
+
+use crate::Session;
+use palpate_exercise::answers::{AnswerRules, HiddenTarget, MarkedPlace, place_count};
+use palpate_exercise::incision::{SeveredPlace, TargetLine};
+use palpate_exercise::tasks::{AvoidedBall, LiftTarget, TaskMeasures};
+use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, ToolRow, register};
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean};
+use palpate_tissue::Model;
+use palpate_tissue::scene::exercise::{Criterion, Exercise, Lump};
+use palpate_tissue::shape::PointId;
+
+/// Judges what is done in an exercise. Show it the session after each step, with the rows of its tools
+/// ([`MeasureRecorder::rows`](crate::measure_recorder::MeasureRecorder::rows)).
+pub struct ExerciseJudge {
+    exercise: Exercise,
+    lumps: Vec<Lump>,
+    tasks: TaskMeasures,
+    /// The point nearest to the place that must be lifted.
+    lifted: Option<PointId>,
+    begin_step: u64,
+    newest: u64,
+}
+
+/// A criterion of the score and what it earned.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EarnedCriterion {
+    /// The criterion.
+    pub criterion: Criterion,
+    /// The value of its measure; `None` if that has none, which earns nothing.
+    pub value: Option<f64>,
+    /// The part of its weight that it earned, 0 to 1.
+    pub part: f64,
+}
+
+/// The score of an exercise.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ExerciseScore {
+    /// The earned part of all weights, in percent.
+    pub percent: f64,
+    /// What each criterion earned.
+    pub criteria: Vec<EarnedCriterion>,
+}
+
+impl ExerciseJudge {
+    /// Begins an exercise at step `begin_step` of a session of this tissue, which has `lumps` ([`Exercise::lumps`]).
+    ///
+    /// # Errors
+    /// Refuses a criterion of a measure that does not exist.
+    pub fn new(exercise: &Exercise, lumps: Vec<Lump>, model: &Model, begin_step: u64) -> Result<Self> {
+        check_criteria(exercise)?;
+        let avoided =
+            exercise.avoid.iter().map(|ball| AvoidedBall { centre_m: ball.centre_m, radius_m: ball.radius_m });
+        let lift = exercise.lift.map(|lift| LiftTarget { height_m: lift.height_m, hold_s: lift.hold_s });
+        Ok(ExerciseJudge {
+            lumps,
+            tasks: TaskMeasures::new(avoided.collect(), lift),
+            lifted: exercise.lift.map(|lift| model.shape().nearest(lift.place_m)),
+            begin_step,
+            newest: begin_step,
+            exercise: exercise.clone(),
+        })
+    }
+
+    /// Takes the session at its present step, with the rows of its tools. Steps that were skipped at rest count as if nothing had
+    /// changed in them.
+    pub fn see(&mut self, session: &Session, rows: &[ToolRow]) {
+        let step = session.step_count();
+        if step > self.newest {
+            let lifted_m = self.lifted.map_or(0.0, |point| session.tissue().point(point).displacement_m.length());
+            self.tasks.step(rows, lifted_m, step - self.newest);
+            self.newest = step;
+        }
+    }
+
+    /// Returns whether the time that the trainee has is up.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn is_time_up(&self, session: &Session) -> bool {
+        let time_s = (session.step_count() - self.begin_step) as f64 / session.model().scene.stepping.rate_hz;
+        self.exercise.time_limit_s.is_some_and(|limit_s| time_s >= limit_s)
+    }
+
+    /// Returns the exercise.
+    pub fn exercise(&self) -> &Exercise {
+        &self.exercise
+    }
+
+    /// Returns the lumps that are hidden.
+    pub fn lumps(&self) -> &[Lump] {
+        &self.lumps
+    }
+
+    /// Returns the figures that need the truth of the exercise, so far.
+    pub fn figures(&self, session: &Session) -> Vec<Figure> {
+        self.truth(session).figures(session.model().scene.stepping.rate_hz, &self.tasks)
+    }
+
+    /// Returns the score by all figures, also those that need no truth; `None` without a criterion.
+    pub fn score(&self, figures: &[Figure]) -> Option<ExerciseScore> {
+        let earned = |criterion: &Criterion| {
+            let of_all = |figure: &&Figure| figure.definition.name == criterion.measure && figure.tool.is_none();
+            // A measure of single tools counts by the worst of them.
+            let of_tools = figures.iter().filter(|figure| figure.definition.name == criterion.measure);
+            let worst = of_tools
+                .map(|figure| figure.value)
+                .min_by(|one, other| criterion.part(*one).total_cmp(&criterion.part(*other)));
+            let value = figures.iter().find(of_all).map(|figure| figure.value).or(worst);
+            EarnedCriterion {
+                criterion: criterion.clone(),
+                value,
+                part: value.map_or(0.0, |value| criterion.part(value)),
+            }
+        };
+        let criteria: Vec<_> = self.exercise.criteria.iter().map(earned).collect();
+        let all: f64 = criteria.iter().map(|earned| earned.criterion.weight).sum();
+        let earned: f64 = criteria.iter().map(|earned| earned.criterion.weight * earned.part).sum();
+        (all > 0.0).then_some(ExerciseScore { percent: 100.0 * earned / all, criteria })
+    }
+
+    fn truth(&self, session: &Session) -> ExerciseTruth {
+        let seen_along = self.exercise.seen_along;
+        let (targets, rules) = match &self.exercise.lumps {
+            None => (Vec::new(), None),
+            Some(hidden) => {
+                let radius_m = 0.5 * (hidden.radius_m[0] + hidden.radius_m[1]) + hidden.found_within_m;
+                let rules = AnswerRules {
+                    seen_along,
+                    within_m: hidden.found_within_m,
+                    place_count: place_count(hidden.from_m, hidden.to_m, seen_along, radius_m),
+                };
+                let target = |lump: &Lump| HiddenTarget { centre_m: lump.centre_m, radius_m: lump.radius_m };
+                // An exercise that never hides anything has no answers.
+                (self.lumps.iter().map(target).collect(), (hidden.count[1] > 0).then_some(rules))
+            }
+        };
+        let answer = |placed: &crate::RecordedMark| MarkedPlace {
+            place_m: placed.mark.place_m,
+            diameter_m: placed.mark.diameter_m,
+        };
+        let line = |line: &palpate_tissue::scene::exercise::CutLine| TargetLine {
+            points_m: line.points_m.clone(),
+            within_m: line.within_m,
+        };
+        ExerciseTruth {
+            seen_along,
+            targets,
+            rules,
+            answers: session.marks().iter().map(answer).collect(),
+            lines: self.exercise.lines.iter().map(line).collect(),
+            severed: severed(session),
+            stitches: session.tissue().ties().into_iter().filter(|tie| !tie.is_broken).count(),
+        }
+    }
+}
+
+/// Refuses a criterion whose measure does not exist.
+fn check_criteria(exercise: &Exercise) -> Result<()> {
+    for (index, criterion) in exercise.criteria.iter().enumerate() {
+        if register::find(&criterion.measure).is_none() {
+            let names = register::definitions().map(|definition| definition.name);
+            let message =
+                format!("there is no measure `{}`{}", criterion.measure, did_you_mean(&criterion.measure, names));
+            return Err(Refusal::new(Reason::WrongKind, format!("criterion[{index}].measure"), message)
+                .within(&format!("exercise {}", exercise.name)));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the options with the limits of an exercise where they have none.
+pub fn with_limits(exercise: &Exercise, options: MeasureOptions) -> MeasureOptions {
+    let coverage_pa = exercise.coverage.map(|coverage| coverage.pressure_pa);
+    let is_default = options.coverage_pa.to_bits() == MeasureOptions::DEFAULT_COVERAGE_PA.to_bits();
+    MeasureOptions {
+        force_limit_n: options.force_limit_n.or(exercise.limits.force_n),
+        coverage_pa: coverage_pa.filter(|_| is_default).unwrap_or(options.coverage_pa),
+        seen_along: Some(exercise.seen_along),
+        ..options
+    }
+}
+
+/// Returns what is severed now, and how far it is open.
+fn severed(session: &Session) -> Vec<SeveredPlace> {
+    let (tissue, model) = (session.tissue(), session.model());
+    let shape = model.shape();
+    let of = |joint: &palpate_tissue::SeveredJoint| {
+        let rest_m = joint.points.map(|point| shape.rest_m(point));
+        let now_m = joint.points.map(|point| shape.rest_m(point) + tissue.point(point).displacement_m);
+        let length_m = |ends: [DVec3; 2]| ends[0].distance(ends[1]);
+        SeveredPlace { rest_m: rest_m[0].lerp(rest_m[1], joint.part), opening_m: length_m(now_m) - length_m(rest_m) }
+    };
+    tissue.cuts().joints(model).iter().map(of).collect()
+}

@@ -1,0 +1,144 @@
+//! An exercise in a score: what was chosen, and what was earned by its criteria.
+
+use std::path::PathBuf;
+
+use palpate_exercise::Figure;
+use palpate_refusal::Refusal;
+use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore};
+use palpate_session::{RecordedMark, Session};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::exercise::{Exercise, Lump};
+use palpate_tissue::scene::exercise_reader::find_exercise;
+use serde::{Deserialize, Serialize};
+
+use super::super::say;
+
+/// Which exercise, with which hidden truth.
+#[derive(clap::Args)]
+pub(crate) struct ExerciseOptions {
+    /// An exercise file, or the name of one that is in ./exercises or built in: `lumps-1`, `lumps-2`, `lumps-3`, `palpate-all`,
+    /// `cut-line`, `lift-hold`, `close-wound`. Its hidden lumps take the place of the scene's own
+    #[arg(long, value_name = "EXERCISE")]
+    exercise: Option<PathBuf>,
+    /// The seed of the exercise's hidden truth [default: that of the exercise]
+    #[arg(long, value_name = "NUMBER", requires = "exercise")]
+    seed: Option<u64>,
+}
+
+/// An exercise and its hidden truth.
+pub(crate) struct ChosenExercise {
+    pub(crate) exercise: Exercise,
+    pub(crate) seed: u64,
+    pub(crate) lumps: Vec<Lump>,
+}
+
+impl ExerciseOptions {
+    /// Reads the exercise; `None` if none was given.
+    ///
+    /// # Errors
+    /// Refuses what [`find_exercise`] refuses, and a seed for whose lumps the exercise has no room.
+    pub(crate) fn chosen(&self) -> Result<Option<ChosenExercise>, Refusal> {
+        let Some(path) = &self.exercise else { return Ok(None) };
+        let exercise = find_exercise(path, &Limits::default())?;
+        let seed = self.seed.unwrap_or(exercise.seed);
+        let lumps = exercise.lumps(seed).ok_or_else(|| {
+            let message = format!("{seed}: the lumps of this seed have no room in their box; take another seed");
+            Refusal::new(palpate_refusal::Reason::OutOfRange, "--seed", message)
+        })?;
+        Ok(Some(ChosenExercise { exercise, seed, lumps }))
+    }
+}
+
+impl ChosenExercise {
+    /// Returns the assignments by which the scene gets the hidden lumps.
+    pub(crate) fn assignments(&self) -> Vec<String> {
+        self.exercise.assignments(&self.lumps)
+    }
+
+    /// Warns if the exercise is made for other scenes than this one.
+    pub(crate) fn warn_of_scene(&self, scene: &str) {
+        if !self.exercise.scenes.iter().any(|name| name == scene) {
+            let (name, made_for) = (&self.exercise.name, self.exercise.scenes.join(", "));
+            say!("palpate: warning: exercise {name}: made for {made_for}; on `{scene}` its places may be wrong");
+        }
+    }
+}
+
+/// A place that the trainee marked.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredAnswer {
+    pub(crate) step: u64,
+    pub(crate) tool: u32,
+    pub(crate) place_m: [f64; 3],
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) diameter_m: Option<f64>,
+}
+
+/// A hidden lump.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredLump {
+    pub(crate) centre_m: [f64; 3],
+    pub(crate) radius_m: f64,
+    pub(crate) stiffness_factor: f64,
+}
+
+/// What a criterion earned.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredCriterion {
+    pub(crate) measure: String,
+    pub(crate) weight: f64,
+    pub(crate) poor: f64,
+    pub(crate) good: f64,
+    /// Absent: the measure has no value, which earns nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) value: Option<f64>,
+    /// The earned part of the weight, 0 to 1.
+    pub(crate) earned: f64,
+}
+
+/// The exercise of a score: its truth, the answers, and what was earned.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredExercise {
+    pub(crate) name: String,
+    pub(crate) seed: u64,
+    /// The earned part of all weights, in percent; absent without a criterion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) score_percent: Option<f64>,
+    pub(crate) criteria: Vec<ScoredCriterion>,
+    pub(crate) lumps: Vec<ScoredLump>,
+    pub(crate) answers: Vec<ScoredAnswer>,
+}
+
+impl ScoredExercise {
+    /// Returns the exercise of a session at its end, by all figures of it.
+    pub(crate) fn of(judge: &ExerciseJudge, seed: u64, session: &Session, figures: &[Figure]) -> Self {
+        let score = judge.score(figures);
+        let criterion = |EarnedCriterion { criterion, value, part }: &EarnedCriterion| ScoredCriterion {
+            measure: criterion.measure.clone(),
+            weight: criterion.weight,
+            poor: criterion.poor,
+            good: criterion.good,
+            value: *value,
+            earned: *part,
+        };
+        let lump = |lump: &Lump| ScoredLump {
+            centre_m: lump.centre_m.to_array(),
+            radius_m: lump.radius_m,
+            stiffness_factor: lump.stiffness_factor,
+        };
+        let answer = |placed: &RecordedMark| ScoredAnswer {
+            step: placed.step,
+            tool: placed.tool,
+            place_m: placed.mark.place_m.to_array(),
+            diameter_m: placed.mark.diameter_m,
+        };
+        ScoredExercise {
+            name: judge.exercise().name.clone(),
+            seed,
+            score_percent: score.as_ref().map(|score| score.percent),
+            criteria: score.iter().flat_map(|ExerciseScore { criteria, .. }| criteria.iter().map(criterion)).collect(),
+            lumps: judge.lumps().iter().map(lump).collect(),
+            answers: session.marks().iter().map(answer).collect(),
+        }
+    }
+}
