@@ -37,7 +37,7 @@ pub(super) struct CuttingTip {
     tip: Tip,
     button: CutButton,
     blade: Blade,
-    /// Whether this leads a tool that another connection may have left in the tissue with a blade.
+    /// Whether the next pose follows a release in any case: another connection may have left the tool in the tissue with a blade.
     is_new: bool,
     /// A place of the surface at the tool, and its normal there, by the newest sample since the blade was sheathed.
     surface_m: Option<(DVec3, DVec3)>,
@@ -68,6 +68,11 @@ impl CuttingTip {
         let tip = if self.blade == Blade::Away { self.tip } else { blade };
         let is_released = std::mem::take(&mut self.is_new) || (before == Blade::Away) != (self.blade == Blade::Away);
         (tip, is_released)
+    }
+
+    /// Lets the next pose follow another release: the server refused the tip.
+    pub(super) fn release_again(&mut self) {
+        self.is_new = true;
     }
 
     /// Learns from a sample of the tool where the surface is.

@@ -370,6 +370,7 @@ async fn connect(
     let mut cutting = cut_button.map(|button| CuttingTip::new(target.tip, button));
     // The sequence of the newest release. Until the server has it, poses follow it by the stream: a datagram would overtake it.
     let mut released = 0;
+    let mut newest_release = 0;
     let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
     // Counts of earlier connections.
     let before = shared.inbound().traffic.carried;
@@ -427,8 +428,14 @@ async fn connect(
                             take(&sample, &mut datagrams, feed);
                         }
                     }
+                    // A datagram with the tip of before that the release has overtaken.
+                    Heard::Rejection(rejection) if rejection.sequence < newest_release => {}
                     Heard::Rejection(rejection) => {
                         shared.inbound().traffic.refused += 1;
+                        if rejection.reason == Reason::OutOfTurn.as_str() {
+                            // Such a datagram came between the release and the first pose with the other tip.
+                            cutting.iter_mut().for_each(CuttingTip::release_again);
+                        }
                         // This side was silent for so long that the server has released the tool.
                         if rejection.reason == Reason::NotHolder.as_str() {
                             return Err(broken("the lease of the tool has expired"));
@@ -463,7 +470,7 @@ async fn connect(
                 let (tip, is_released) = led.unwrap_or((target.tip, false));
                 if is_released {
                     trail.sequence += 1;
-                    released = trail.sequence;
+                    (released, newest_release) = (trail.sequence, trail.sequence);
                     let (tool, sequence, action) = (target.tool, Some(released), Some(Action::Release(pb::Release {})));
                     let release = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
                     // It must not be dropped, as the next pose has another tip. Samples wait meanwhile.
