@@ -426,13 +426,13 @@ fn a_run_warns_if_its_blade_leaves_a_solid_no_room_for_further_cuts() {
         let mut poses = String::new();
         for (plane, x_m) in planes_x_m.iter().enumerate() {
             for end in 0..2 {
-                let at_s = 0.1 * plane as f64 + 0.08 * f64::from(end);
+                let at_s = 0.3 * plane as f64 + 0.26 * f64::from(end);
                 let y_m = if end == plane as u32 % 2 { -0.06 } else { 0.06 };
                 let upright = "orientation = [0.70710678, 0, 0.70710678, 0]";
                 poses += &format!("{{ at_s = {at_s:?}, place_m = [{x_m:?}, {y_m:?}, 0.005], {upright} }},\n");
             }
         }
-        let duration_s = 0.1 * planes_x_m.len() as f64;
+        let duration_s = 0.3 * planes_x_m.len() as f64;
         let text = format!(
             "duration_s = {duration_s:?}\nsample_every_s = 0.1\n[[tool]]\nblade = {{ length_m = 0.06 }}\nposes = [\n{poses}]\n"
         );

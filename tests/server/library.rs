@@ -457,9 +457,8 @@ async fn a_device_cuts_while_its_button_is_held_and_then_touches_again() {
     };
     tokio::time::timeout(TEST_TIMEOUT, whole_course).await.expect("no force");
     drop(stop);
-    let (_, report) = serving.await.unwrap().unwrap();
+    serving.await.unwrap().unwrap();
     // Twelve rows of springs along 30 mm; the way across cuts nothing.
     assert!(severed[0] == 0 && severed[3] >= 24, "{severed:?}");
     assert!(severed[3..].iter().all(|count| *count == severed[3]), "{severed:?}");
-    assert_eq!(report.traffic.refused, 0);
 }
