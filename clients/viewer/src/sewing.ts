@@ -3,7 +3,7 @@
 // A thread or clip belongs to the session. So all of them are listed, also those of others, and anybody may take them off.
 
 import { type MessageInitShape } from "@bufbuild/protobuf";
-import { norm, plus, type Vec3 } from "palpate";
+import { norm, plus, type Tool, type Vec3 } from "palpate";
 import type { BiteSchema, LaidTie, Thread } from "palpate/v1";
 import { Vector3 } from "three";
 import type { Mode } from "./hand";
@@ -26,6 +26,8 @@ const FRICTION = 0.2;
 const BETWEEN = 6;
 /** Time after which a session tells of what was just laid, ms. */
 const TOLD_MS = 80;
+/** A tool that has only laid or cut something is released after this time, so that others can use it. */
+const LEAVES_MS = 600;
 
 /** Returns whether a press picks a bite. */
 export function sews(mode: Mode): mode is "thread" | "clip" {
@@ -70,6 +72,7 @@ export class Sewing {
   private chosen: number | undefined;
   /** What was laid and the session has not told of yet. */
   private unseen: number | undefined;
+  private leaving: ReturnType<typeof setTimeout> | undefined;
   private isSending = false;
   private isStale = false;
   private drawn = { surface: undefined as Surface | undefined, key: "" };
@@ -138,7 +141,7 @@ export class Sewing {
     if (this.host.present() !== session) return;
     if (!isLaid) this.unseen = undefined;
     else if (kind === "thread") this.chosen = number;
-    this.askSoon(session);
+    this.done(session, tool);
     this.tell();
   }
 
@@ -154,8 +157,9 @@ export class Sewing {
       const thread = session && this.threadOf(session, this.chosen);
       if (!session || !thread || this.chosen === undefined) break;
       const { bites, friction, strengthN } = thread.value;
-      await session.hand.tool.thread(this.chosen, { bites, lengthM: this.part * wayM(thread.bites), friction, strengthN });
-      this.askSoon(session);
+      const { tool } = session.hand;
+      await tool.thread(this.chosen, { bites, lengthM: this.part * wayM(thread.bites), friction, strengthN });
+      this.done(session, tool);
     }
     this.isSending = false;
   }
@@ -163,12 +167,18 @@ export class Sewing {
   private async takeOff(number: number): Promise<void> {
     const session = this.host.present();
     if (!session) return;
-    await session.hand.tool.untie(number);
-    this.askSoon(session);
+    const { tool } = session.hand;
+    await tool.untie(number);
+    this.done(session, tool);
   }
 
-  private askSoon(session: ShownSession): void {
+  /** Asks for what was done, and leaves the tool to others unless it touches. */
+  private done(session: ShownSession, tool: Tool): void {
     setTimeout(() => this.host.present() === session && session.askNow(), TOLD_MS);
+    clearTimeout(this.leaving);
+    this.leaving = setTimeout(() => {
+      if (!tool.touches) void tool.letGo();
+    }, LEAVES_MS);
   }
 
   /** Returns a thread of the session by its number, and its bites. */

@@ -71,6 +71,7 @@ describe("a thread", () => {
     await page.until(({ sewing }, wayM) => sewing.ties[0]?.pathM < 0.75 * wayM && sewing.ties[0].tensionN > 1e-3, wayM);
     await page.picture("suture-sewn");
     assert.deepEqual(await cut(page), []);
+    await page.until(({ holds }) => !holds);
     // Another page sees the same thread, and takes it off.
     const late = await open(page.page.url());
     await late.says("ties", /Thread 1/);
