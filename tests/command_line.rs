@@ -196,3 +196,60 @@ fn a_score_has_what_the_tools_did_and_sessions_compare() {
         says(palpate(folder.path(), arguments), 2, &[part]);
     }
 }
+
+#[test]
+fn an_exercise_is_judged_by_its_truth_and_another_seed_hides_something_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let read = |name: &str| -> serde_json::Value {
+        serde_json::from_str(&std::fs::read_to_string(folder.path().join(name)).unwrap()).unwrap()
+    };
+    let script = |name: &str, marks: &[(f64, f64)]| {
+        let mut text = "duration_s = 0.2\nsample_every_s = 0.1\n[[tool]]\ntip = { shape = \"sphere\" }\n\
+                        poses = [{ at_s = 0.0, place_m = [0.0, 0.0, 0.046] }, { at_s = 0.1, place_m = [0.0, 0.0, 0.043] }]\n"
+            .to_owned();
+        for (x, y) in marks {
+            text += &format!("[[mark]]\nat_s = 0.15\nplace_m = [{x}, {y}, 0.04]\ndiameter_m = 0.017\n");
+        }
+        std::fs::write(folder.path().join(name), text).unwrap();
+    };
+    let run = |script: &str, score: &str, more: &[&str]| {
+        let run =
+            ["run", "phantom", script, "--quiet", "--output", "r.jsonl", "--score", score, "--exercise", "lumps-2"];
+        palpate(folder.path(), &[&run[..], more].concat())
+    };
+    script("silent.toml", &[]);
+    says(run("silent.toml", "silent.json", &["--seed", "7"]), 0, &[]);
+    let silent = read("silent.json");
+    let lumps = silent["exercise"]["lumps"].as_array().unwrap();
+    let at = |lump: &serde_json::Value| (lump["centre_m"][0].as_f64().unwrap(), lump["centre_m"][1].as_f64().unwrap());
+    let found: Vec<(f64, f64)> = lumps.iter().map(at).collect();
+    assert!(!found.is_empty() && figure(&silent, "hits") == 0.0 && figure(&silent, "misses") == found.len() as f64);
+    // A mark over each lump, and one in a corner.
+    let marks: Vec<_> = found.iter().copied().chain([(0.049, 0.049)]).collect();
+    script("sure.toml", &marks);
+    says(run("sure.toml", "sure.json", &["--seed", "7"]), 0, &[]);
+    let sure = read("sure.json");
+    for (name, expected) in [("hits_share", 1.0), ("misses", 0.0), ("false_alarms", 1.0), ("place_error_m", 0.0)] {
+        assert!((figure(&sure, name) - expected).abs() < 1e-9, "{name}: {sure}");
+    }
+    let percent = |score: &serde_json::Value| score["exercise"]["score_percent"].as_f64().unwrap();
+    assert!(figure(&sure, "d_prime") > figure(&silent, "d_prime") && percent(&sure) > percent(&silent), "{sure}");
+    assert_eq!(sure["exercise"]["answers"].as_array().unwrap().len(), marks.len());
+    // What is hidden is felt: the tissue is another one.
+    says(run("silent.toml", "other.json", &["--seed", "8"]), 0, &[]);
+    assert_ne!(read("other.json")["exercise"]["lumps"], silent["exercise"]["lumps"]);
+    assert_ne!(figure(&read("other.json"), "peak_force_n"), figure(&silent, "peak_force_n"));
+    std::fs::write(
+        folder.path().join("mine.toml"),
+        "name = \"mine\"\ninstructions = \"Press.\"\nscenes = [\"liver\"]\n[[criterion]]\nmeasure = \"peak_forc_n\"\npoor = 2\ngood = 1\n",
+    )
+    .unwrap();
+    for (exercise, part) in [
+        ("lumps-9", "there is no exercise `lumps-9`"),
+        ("mine.toml", "there is no measure `peak_forc_n`; did you mean `peak_force_n`?"),
+        ("silent.toml", "silent.toml: is a script"),
+    ] {
+        says(palpate(folder.path(), &["check", "liver", "--exercise", exercise]), 2, &[part]);
+    }
+    says(palpate(folder.path(), &["check", "liver", "--exercise", "lumps-1"]), 0, &["made for phantom"]);
+}
