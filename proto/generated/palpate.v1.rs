@@ -2010,7 +2010,7 @@ pub enum TipShape {
     RigidDisc = 2,
     /// A rigid sphere. The tool's place is its centre. Solids only.
     Sphere = 3,
-    /// A blade, which severs what its edge crosses. The tool's place is the tip of the edge. Sheets and surfaces only.
+    /// A blade, which severs what its edge crosses. The tool's place is the tip of the edge.
     Blade = 4,
 }
 impl TipShape {

@@ -129,7 +129,7 @@ class Tissue:
 class Tip:
     """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
     `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
-    `edge_m` it is a blade, whose edge runs from its place by that vector: on sheets and surfaces only. With
+    `edge_m` it is a blade, whose edge runs from its place by that vector. With
     `burn_s`, s, a disc severs by heat what it has touched for that time: on sheets and surfaces only."""
 
     def __init__(
