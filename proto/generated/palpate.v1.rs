@@ -3890,6 +3890,9 @@ pub struct Session {
     /// As Sample.cuts_exhausted.
     #[prost(bool, tag = "40")]
     pub cuts_exhausted: bool,
+    /// Energy that has gone into separation, J: the work of blades at their edges, and what severed springs had stored.
+    #[prost(double, tag = "41")]
+    pub fracture_j: f64,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";

@@ -693,6 +693,7 @@ Field { number: 37, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 38, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 39, is_list: true, kind: FieldKind::Message(99) },
 Field { number: 40, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 41, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.LaidTie", bytes: size_of::<crate::pb::LaidTie>(), decode: |bytes| <crate::pb::LaidTie as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(11) },

@@ -55,6 +55,7 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
         }),
         topology_version: status.cuts.version(),
         severed: count(status.cuts.len()),
+        fracture_j: status.cuts.fracture_j(),
         // Counting looks at all springs.
         pieces: if status.cuts.is_empty() { 1 } else { count(status.cuts.pieces(model)) },
         cuts_exhausted: !status.cuts.has_room(model),

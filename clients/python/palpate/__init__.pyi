@@ -213,6 +213,9 @@ class Session:
     def pieces(self) -> int:
         """The number of parts of the tissue: 1 if it is whole."""
     @property
+    def fracture_j(self) -> float:
+        """The energy that has gone into separation, J: the work of blades at their edges, and what severed springs had stored."""
+    @property
     def fault(self) -> Optional[str]:
         """Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None if
         it is."""

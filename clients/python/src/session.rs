@@ -192,6 +192,12 @@ impl Session {
         })
     }
 
+    /// The energy that has gone into separation, J: the work of blades at their edges, and what severed springs had stored.
+    #[getter]
+    fn fracture_j(&self, py: Python<'_>) -> f64 {
+        self.with(py, |inner| inner.simulation.session.tissue().cuts().fracture_j())
+    }
+
     /// Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None
     /// if it is.
     #[getter]

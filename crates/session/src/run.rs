@@ -356,7 +356,12 @@ pub fn write_event(output: &mut dyn Write, progress: &mut dyn FnMut(u64), event:
 /// Returns how blades have changed what joins the points of a tissue.
 pub fn topology(tissue: &dyn Tissue) -> TopologyRecord {
     let cuts = tissue.cuts();
-    TopologyRecord { topology_version: cuts.version(), severed: cuts.len(), pieces: cuts.pieces(tissue.model()) }
+    TopologyRecord {
+        topology_version: cuts.version(),
+        severed: cuts.len(),
+        pieces: cuts.pieces(tissue.model()),
+        fracture_j: cuts.fracture_j(),
+    }
 }
 
 /// Returns the summary of a run that ended with this tissue and whose steps took `wall_s`, s: counts, time per point

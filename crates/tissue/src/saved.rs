@@ -161,6 +161,9 @@ pub struct TissueParts {
     /// What tips have burnt, behind these.
     #[serde(skip)]
     pub burns: SavedBurns,
+    /// The energy that has gone into cuts, behind these.
+    #[serde(skip)]
+    pub fracture: SavedFracture,
 }
 
 /// The state that the guard goes back to.
@@ -449,6 +452,21 @@ impl SavedBurns {
     /// Returns whether nothing is burnt.
     pub fn is_empty(&self) -> bool {
         self.now.is_empty() && self.at_checkpoint.is_empty()
+    }
+}
+
+/// The energy that has gone into cuts, J ([`Cuts::fracture_j`](crate::Cuts::fracture_j)): now, and at the checkpoint. A snapshot without
+/// any has the bytes that it had before it was counted.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct SavedFracture {
+    pub(crate) now_j: f64,
+    pub(crate) at_checkpoint_j: f64,
+}
+
+impl SavedFracture {
+    /// Returns whether no energy has gone into cuts.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
     }
 }
 

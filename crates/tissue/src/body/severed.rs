@@ -39,6 +39,8 @@ pub struct Cuts {
     version: u32,
     /// The version since which springs were severed only, and none became whole again.
     grows_since: u32,
+    /// The energy that has gone into separation, J ([`Cuts::fracture_j`]).
+    fracture_j: f64,
     /// The corners of a solid that these cuts double; `None` without any, and for other tissues.
     copies: Option<Arc<CornerCopies>>,
 }
@@ -70,6 +72,12 @@ impl Cuts {
     /// Returns the number of severed springs.
     pub fn len(&self) -> usize {
         self.springs.len()
+    }
+
+    /// Returns the energy that has gone into separation, J: the work of blades at their edges, Gc for each unit of area that they cut,
+    /// and what severed springs had stored. (Severing a face between the cells of a solid sets no energy free.)
+    pub fn fracture_j(&self) -> f64 {
+        self.fracture_j
     }
 
     /// Returns whether the tissue is whole.
@@ -128,14 +136,14 @@ impl Cuts {
         self.springs.iter().zip(&*other.springs).take_while(|(one, other)| one == other).count()
     }
 
-    /// Returns the cuts of the first `count` springs.
-    pub(crate) fn first(&self, count: usize, model: &Model) -> Self {
+    /// Returns the cuts of the first `count` springs, into which `fracture_j` had gone then.
+    pub(crate) fn first(&self, count: usize, fracture_j: f64, model: &Model) -> Self {
         let mut first = Severed::default();
         for spring in &self.springs[..count.min(self.springs.len())] {
             first.add(model, *spring);
         }
         let version = self.springs[..first.len()].last().map_or(0, |last| last.version);
-        Cuts { version, grows_since: self.grows_since, ..first.cuts }
+        Cuts { version, grows_since: self.grows_since, fracture_j, ..first.cuts }
     }
 
     /// Returns the doubled corners of a solid; `None` if nothing is severed, and for other tissues.
@@ -185,8 +193,8 @@ impl Cuts {
         self.springs.iter().map(of).collect()
     }
 
-    /// Checks saved springs and returns them; `version` is that of the topology.
-    pub(crate) fn restored(saved: &[SavedSpring], version: u32, model: &Model) -> Result<Self> {
+    /// Checks saved springs and returns them; `version` is that of the topology, and `fracture_j` has gone into them.
+    pub(crate) fn restored(saved: &[SavedSpring], version: u32, fracture_j: f64, model: &Model) -> Result<Self> {
         ensure(version < MAX_VERSION, "a version of the topology beyond what any session has")?;
         let mut severed = Severed::default();
         for SavedSpring { place, number, part, version: since } in saved.iter().copied() {
@@ -202,7 +210,7 @@ impl Cuts {
             ensure(severed.has_room(model), "more severed springs than the tissue has room for")?;
             ensure(severed.add(model, spring).is_some(), "a spring that is severed twice")?;
         }
-        Ok(Cuts { version, grows_since: version, ..severed.cuts })
+        Ok(Cuts { version, grows_since: version, fracture_j, ..severed.cuts })
     }
 }
 
@@ -261,6 +269,11 @@ impl Severed {
         let doubled = Arc::make_mut(&mut copies).sever(places, face_of, face.version, is_severed);
         self.cuts.copies = Some(copies);
         doubled
+    }
+
+    /// Adds energy that goes into separation, J.
+    pub(crate) fn add_fracture(&mut self, energy_j: f64) {
+        self.cuts.fracture_j += energy_j;
     }
 
     /// Begins a version of the topology.

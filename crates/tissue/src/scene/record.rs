@@ -248,7 +248,7 @@ pub struct Summary {
 }
 
 /// How blades have changed what joins the points of a tissue, at the end of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TopologyRecord {
     /// Version of the topology: 0 if nothing was severed ([`Cuts::version`](crate::Cuts::version)).
     pub topology_version: u32,
@@ -256,6 +256,8 @@ pub struct TopologyRecord {
     pub severed: usize,
     /// Number of parts of the tissue; 1 for one that is whole.
     pub pieces: usize,
+    /// Energy that has gone into separation, J ([`Cuts::fracture_j`](crate::Cuts::fracture_j)).
+    pub fracture_j: f64,
 }
 
 /// What a thread or clip bore in a run.

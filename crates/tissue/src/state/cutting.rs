@@ -115,6 +115,9 @@ impl<T: Real> TissueState<T> {
 
     /// Severs the springs that blades cross in this step, those that burn through, and those that tear.
     pub(super) fn cut(&mut self) {
+        for tool in &mut self.contacts.tools {
+            self.tables.severed.add_fracture(std::mem::take(&mut tool.separated_j));
+        }
         let burnt = self.burnt();
         let blades = self.contacts.tools.iter().filter(|tool| tool.tip.shape == TipShape::Blade);
         let sweeps: Vec<EdgeSweep> = blades.map(EdgeSweep::of).collect();
@@ -271,7 +274,9 @@ impl<T: Real> TissueState<T> {
         let force_n = (along + tension_n_per_m) * (rest_m + delta_m);
         let stored_j = 0.5 * slack_n_per_m * rest_m.length_squared() * extension * extension
             + 0.5 * tension_n_per_m * delta_m.length_squared();
-        self.work.add(-tension_n_per_m * rest_m.dot(delta_m) - stored_j);
+        let released_j = tension_n_per_m * rest_m.dot(delta_m) + stored_j;
+        self.work.add(-released_j);
+        self.tables.severed.add_fracture(released_j);
         let unit = self.plan.spring_unit(&model.scene);
         let history = self.plan.scheme.history();
         for (place, force_n) in ends.into_iter().zip([force_n, -force_n]) {
@@ -288,6 +293,8 @@ impl<T: Real> TissueState<T> {
 }
 
 mod burning;
+#[cfg(test)]
+mod energy_tests;
 mod faces;
 mod tearing;
 #[cfg(test)]

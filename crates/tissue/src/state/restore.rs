@@ -17,8 +17,8 @@ use crate::kernel::region::sides_of;
 use crate::limits::Limits;
 use crate::memory;
 use crate::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedBurns, SavedCheckpoint, SavedContact, SavedForces, SavedInput, SavedPrescribed,
-    SavedState, SavedTie, SavedTies, TissueParts, ensure, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedBurns, SavedCheckpoint, SavedContact, SavedForces, SavedFracture, SavedInput,
+    SavedPrescribed, SavedState, SavedTie, SavedTies, TissueParts, ensure, unsound,
 };
 use crate::scene::{Named, Precision};
 use crate::state::guard::checkpoint::Checkpoint;
@@ -200,6 +200,10 @@ impl<T: Real> SavedState for TypedState<T> {
                 now: self.burns.clone(),
                 at_checkpoint: self.checkpoint.as_ref().map_or_else(Vec::new, |from| from.contacts.burns.saved()),
             },
+            fracture: SavedFracture {
+                now_j: self.cuts.fracture_j(),
+                at_checkpoint_j: self.checkpoint.as_ref().map_or(0.0, |from| from.cuts.fracture_j()),
+            },
         };
         PlainTissue { parts, values }
     }
@@ -249,7 +253,8 @@ fn restored_as<T: Real>(
     sheet.contacts.burns = Burns::restored(&parts.burns.now, model)?;
     sheet.work = WorkAccount::restored(&parts.work)?;
     sheet.tiles.restore(&parts.tiles)?;
-    let cuts = Cuts::restored(&parts.severed, parts.topology_version, model)?;
+    let fracture_j = checks.number(parts.fracture.now_j)?;
+    let cuts = Cuts::restored(&parts.severed, parts.topology_version, fracture_j, model)?;
     sheet.tables.set_severed(model, &cuts);
     sheet.follow_cuts();
 
@@ -286,7 +291,7 @@ fn restored_as<T: Real>(
     let checkpoint = parts.checkpoint.as_ref().map(|saved| {
         let mut state = State::zero(&layout, sheet.state.kept.len());
         fill(&mut state)?;
-        checkpoint_of(&sheet, (saved, &parts.ties.at_checkpoint, &parts.burns.at_checkpoint), state, &checks)
+        checkpoint_of(&sheet, parts, saved, state, &checks)
     });
     sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
     sheet.tiles.remember_again(&mut values)?;
@@ -310,7 +315,8 @@ fn restored_as<T: Real>(
 
 fn checkpoint_of<T: Real>(
     tissue: &TissueState<T>,
-    (saved, ties, burns): (&SavedCheckpoint, &[SavedTie], &[(u32, u32)]),
+    parts: &TissueParts,
+    saved: &SavedCheckpoint,
     state: State<T>,
     checks: &Checks<'_>,
 ) -> Result<Checkpoint<T>> {
@@ -322,9 +328,10 @@ fn checkpoint_of<T: Real>(
     let severed = usize::try_from(saved.severed).unwrap_or(usize::MAX);
     ensure(severed <= tissue.tables.severed.len(), "more severed springs in its checkpoint than now")?;
     let scale = halved(model, saved.halvings).force_scale(&model.scene);
-    let cuts = tissue.tables.severed.first(severed, model);
-    let mut contacts = Contacts::restored((&saved.contacts, ties), model, checks)?;
-    contacts.burns = Burns::restored(burns, model)?;
+    let fracture_j = checks.number(parts.fracture.at_checkpoint_j)?;
+    let cuts = tissue.tables.severed.first(severed, fracture_j, model);
+    let mut contacts = Contacts::restored((&saved.contacts, &parts.ties.at_checkpoint), model, checks)?;
+    contacts.burns = Burns::restored(&parts.burns.at_checkpoint, model)?;
     let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
     contacts.follow_cuts(model, cuts.copies());
     if let Some(copies) = cuts.copies() {

@@ -74,6 +74,7 @@ impl Tool {
         let lag_m = most_n / stiffness_n_per_m;
         let slid_m = (across_m.dot(ahead) - lag_m).max(0.0).min(self.footprint.stride_m());
         self.footprint.shift(model, slid_m * ahead, &along);
+        self.separated_j += most_n * slid_m;
         self.kicked_to(most_n * ahead)
     }
 }

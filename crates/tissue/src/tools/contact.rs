@@ -164,6 +164,8 @@ pub(crate) struct Tool {
     /// The part of that force that continues in the next substep, without the impulse of meeting.
     pub(crate) steady_n: DVec3,
     pub(crate) velocity_m_per_s: DVec3,
+    /// The work of separation of a blade in this step so far, J; 0 between steps.
+    pub(crate) separated_j: f64,
     /// How a rigid tip presses; `None` for a disc of even pressure.
     pub(crate) rigid: Option<RigidTip>,
 }
@@ -226,6 +228,7 @@ impl Contacts {
             force_n: DVec3::ZERO,
             steady_n: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
+            separated_j: 0.0,
             rigid: rigid_tip(tip),
         };
         self.tools.insert(index, tool);
@@ -408,6 +411,7 @@ impl Tool {
             force_n: checks.vector(saved.force_n)?,
             steady_n: checks.vector(saved.steady_n)?,
             velocity_m_per_s: checks.vector(saved.velocity_m_per_s)?,
+            separated_j: 0.0,
             rigid,
         })
     }
