@@ -208,4 +208,4 @@ impl<T: Real> TissueState<T> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -147,8 +147,12 @@ fn severing_faces_gives_and_takes_no_energy() {
 }
 
 /// Returns a cube of `side`³ cells of 2 mm, held below, E = 10 kPa, ν = 0.3.
-fn cube(side: usize) -> Arc<Model> {
-    let edge_m = 0.002;
+pub(in crate::state::cutting) fn cube(side: usize) -> Arc<Model> {
+    cube_of(side, 0.002, &[])
+}
+
+/// Returns such a cube of cells of any size.
+pub(in crate::state::cutting) fn cube_of(side: usize, edge_m: f64, more: &[&str]) -> Arc<Model> {
     let sets = [
         "material.poissons_ratio=0.3",
         "stepping.precision=f64",
@@ -156,7 +160,7 @@ fn cube(side: usize) -> Arc<Model> {
         "stepping.rate_hz=2000",
         "sleep.tolerance=0",
     ];
-    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    let sets: Vec<String> = sets.iter().chain(more).map(|set| (*set).to_owned()).collect();
     let mut scene = Scene::parse("block", BLOCK, &sets, &Limits::default()).unwrap();
     let Body::Solid(solid) = &scene.body else { panic!("of another kind") };
     let material = SolidMaterial { youngs_modulus_pa: 1e4, damping_per_s: 150.0, ..solid.material };

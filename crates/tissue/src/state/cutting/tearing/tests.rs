@@ -11,6 +11,7 @@ use crate::limits::Limits;
 use crate::scene::Scene;
 use crate::scene::profile::{MotionProfile, Move};
 use crate::shape::PointId;
+use crate::state::cutting::faces::tests::cube_of;
 use crate::{Grasp, Model, at_rest, restored};
 
 /// The side of a square, m, and the strain to which it is led.
@@ -93,6 +94,41 @@ fn a_tear_starts_at_the_stated_strain_whatever_the_mesh() {
             }
             assert_eq!(tissue.cuts().version(), 1);
         }
+    }
+}
+
+#[test]
+fn a_tear_in_a_solid_starts_at_the_stated_strain_whatever_the_size_of_its_cells() {
+    let side_m = 0.016;
+    for (cells, limit, reference) in [(4_u32, 0.1, None), (6, 0.1, None), (8, 0.1, None), (8, 0.05, Some(0.008))] {
+        let edge_m = side_m / f64::from(cells);
+        let mut sets = vec![format!("cutting.tear_strain={limit}")];
+        sets.extend(reference.map(|edge_m: f64| format!("cutting.tear_reference_m={edge_m}")));
+        let model = cube_of(cells as usize, edge_m, &sets.iter().map(String::as_str).collect::<Vec<_>>());
+        let mut tissue = at_rest(&model);
+        let is_rim = |at_m: DVec3| at_m.min_element() < 1e-9 || at_m.max_element() > side_m - 1e-9;
+        let rim =
+            model.points().filter(|point| is_rim(model.shape().rest_m(*point)) && !model.shape().is_fixed(*point));
+        for (tool, point) in rim.enumerate() {
+            let by_m = LED * model.shape().rest_m(point).z * DVec3::Z;
+            tissue.grasp(
+                tool,
+                point,
+                Grasp::Profile(MotionProfile { point, moves: vec![Move { from_s: 0.0, to_s: LED_S, by_m }] }),
+            );
+        }
+        let rate_hz = model.scene.stepping.rate_hz;
+        while tissue.cuts().is_empty() && tissue.step_count() < (LED_S * rate_hz) as u64 {
+            tissue.step().unwrap();
+        }
+        let began = strain(tissue.step_count() as f64 / rate_hz);
+        println!("{cells}³ cells, {limit}: {began:.4}");
+        assert!((began / 0.1 - 1.0).abs() < 0.02, "{cells} {limit}: {began}");
+        let along_z = |joint: &crate::SeveredJoint| {
+            let [a_m, b_m] = joint.points.map(|point| model.shape().rest_m(point));
+            (b_m - a_m).distance(edge_m * DVec3::Z) < 1e-9
+        };
+        assert!(tissue.cuts().joints(&model).iter().all(along_z), "{cells}");
     }
 }
 
