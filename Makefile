@@ -16,7 +16,7 @@ XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 
 PACKAGES := deb wheel npm crates library image helm unity unreal
 
-.PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states film scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress stress-cuts libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states film scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-solid bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python chaos site
 
@@ -46,6 +46,7 @@ help:
 	@echo 'make test-mutants    the number of 300 mutants of kernel, touch and sessions that the tests catch (an hour or two)'
 	@echo 'make stress          ten thousand random scenes, a million steps on 200 meshes, ten million steps, a thousand thin meshes,'
 	@echo '                     five thousand snapshots (an hour or two)'
+	@echo 'make stress-cuts     random cuts, tears, threads and clips until CUTS=1000000 springs are severed, from seed FROM=0 on, with progress'
 	@echo 'make fuzz            a million malformed inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
 	@echo 'make lint            formatting, compiler and clippy warnings, and the counts of tests/counts.py'
@@ -231,6 +232,12 @@ bench-frames: need-rust
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_SOLIDS=1000 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 PALPATE_STRESS_CUTS=1000000 \
 		$(CARGO) test --release --test stress --test legal --test physics --test thin --test restored --test cuts -- --include-ignored --nocapture
+
+# Random cuts alone: CUTS severed springs and faces, from the random seed FROM on, with progress.
+CUTS ?= 1000000
+FROM ?= 0
+stress-cuts: need-rust
+	PALPATE_STRESS_CUTS=$(CUTS) PALPATE_STRESS_CUTS_FROM=$(FROM) $(CARGO) test --release --test cuts -- --nocapture
 
 # The unit tests of the tissue, and the golden hashes.
 KERNEL := --package palpate-tissue --package palpate --lib --test determinism
