@@ -235,8 +235,8 @@ impl<T: Real> TissueState<T> {
                 (place, place_m, spring, span_m)
             } else {
                 let number = model.number_at_other_end(place, spring.number);
-                let spring = SpringEnd { number, other: place, rest: -spring.rest, ..spring };
-                (spring.other, place_m + span_m, spring, -span_m)
+                let from_other = SpringEnd { number, other: place, rest: -spring.rest, ..spring };
+                (spring.other, place_m + span_m, from_other, -span_m)
             };
             if let Some(part) = sweep.crosses(first_m, span_m, moved_m) {
                 found.push(Crossing { place: first, spring, part });
