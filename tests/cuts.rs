@@ -266,7 +266,7 @@ fn tissues_that_are_cut_at_random_stay_finite_and_fall_into_the_pieces_that_a_se
     while severed < wanted {
         let seeds: Vec<u64> = (seed..seed + models.len() as u64).collect();
         let found = cases::on_every_core(&seeds, |seed| cut_at_random(&models[*seed as usize % models.len()], *seed));
-        assert!(found.iter().all(|of_tissue| *of_tissue > 0) || seed > 216, "{found:?}: nothing was cut");
+        assert!(found.iter().any(|of_tissue| *of_tissue > 0), "from seed {seed} on: nothing was cut");
         severed += found.iter().sum::<usize>();
         seed += models.len() as u64;
         if severed / 10_000 > told {

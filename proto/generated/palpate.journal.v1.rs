@@ -133,10 +133,10 @@ impl ::prost::Name for Command {
 /// A place that a person marked on the surface, as an answer in an exercise.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Mark {
-    /// In the tissue's frame.
+    /// In the tissue's frame, m.
     #[prost(message, optional, tag = "1")]
     pub place_m: ::core::option::Option<crate::pb::Vector3>,
-    /// The diameter of what they think is there. Absent: they don't say.
+    /// The diameter of what they think is there, m. Absent: they don't say.
     #[prost(double, optional, tag = "2")]
     pub diameter_m: ::core::option::Option<f64>,
 }

@@ -60,10 +60,8 @@ fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
 /// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
-    let assignments = chosen.as_ref().map(ChosenExercise::assignments).unwrap_or_default();
-    let (model, limits) = compile_with(&arguments.scene, &assignments)?;
+    let (model, limits) = ChosenExercise::compile(chosen.as_ref(), &arguments.scene)?;
     if let Some(chosen) = &chosen {
-        chosen.warn_of_scene(&model.scene.name);
         ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
     }
     let script = arguments.script.as_ref().map(|path| find_script(path, &model.scene, &limits)).transpose()?;

@@ -11,7 +11,7 @@ use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, StageTime, Summary};
 
 use super::indent::{self, IndentArguments};
-use super::scene::{SceneArguments, compile_with};
+use super::scene::SceneArguments;
 use super::score::exercise::{ChosenExercise, ExerciseOptions};
 use super::score::{ScoreOptions, ScoreRecorder, ScoreSource};
 use super::{Failure, clock_s, say, with_progress};
@@ -60,12 +60,15 @@ pub(crate) struct RunArguments {
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
-    let assignments = chosen.as_ref().map(ChosenExercise::assignments).unwrap_or_default();
-    let (model, limits) = compile_with(&arguments.scene, &assignments)?;
-    chosen.iter().for_each(|chosen| chosen.warn_of_scene(&model.scene.name));
-    let options = arguments.score_options.checked()?;
+    let (model, limits) = ChosenExercise::compile(chosen.as_ref(), &arguments.scene)?;
+    let options = arguments.score_options.checked(ChosenExercise::thresholds(chosen.as_ref()))?;
     if let (None, Some(option)) = (&arguments.score, arguments.score_options.given()) {
         return Err(Failure::Refused(format!("{option}: goes with --score FILE alone")));
+    }
+    if let (None, Some(_)) = (&arguments.score, &chosen) {
+        return Err(Failure::Refused(
+            "--exercise: goes with --score FILE alone: without it nothing is judged".to_owned(),
+        ));
     }
     if arguments.script.as_os_str() == indent::NAME {
         if arguments.score.is_some() {

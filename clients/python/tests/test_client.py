@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import unittest
 from pathlib import Path
 
@@ -186,8 +187,10 @@ class Clients(Served, unittest.TestCase):
             session.clip(3, 2, [(0.03, 0.05, 0.0), (0.034, 0.05, 0.0)])
 
             def until(is_so):
+                deadline = time.monotonic() + 60
                 while not is_so(session.status()["ties"]):
-                    pass
+                    assert time.monotonic() < deadline, session.status()
+                    time.sleep(0.02)
 
             until(lambda ties: sorted(ties) == [2, 7] and ties[7]["path_m"] < 0.0101 and ties[7]["tension_n"] > 1e-3)
             session.release(3)

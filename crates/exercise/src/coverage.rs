@@ -1,6 +1,7 @@
 //! How hard each place of a surface was pressed at most, and which share of it was pressed hard enough.
 //!
-//! The surface is divided into small parts of about the same size, at most some 40,000, however coarse its triangles are. A
+//! The surface is divided into small parts of about the same size, some 20,000, however coarse its triangles are; each triangle is at
+//! least one. A
 //! part belongs to a disc if its middle is within the disc's radius, and it faces the same side.
 
 use glam::DVec3;
@@ -109,16 +110,16 @@ impl PressedSurface {
         let least = cell_of(disc.rest_m - reach_m, self.cell_m);
         let most = cell_of(disc.rest_m + reach_m, self.cell_m);
         let mut next = self.cells.partition_point(|cell| *cell < least);
-        // Cells are in the order of x, y and z: rows of cells that are beside the disc are leapt over.
+        // Cells are in the order of x, y and z: rows of cells that are beside the disc are skipped.
         while let Some(cell) = self.cells.get(next).copied().filter(|cell| cell[0] <= most[0]) {
-            let leap = match () {
+            let target = match () {
                 () if cell[1] < least[1] => Some([cell[0], least[1], least[2]]),
                 () if cell[1] > most[1] => Some([cell[0] + 1, least[1], least[2]]),
                 () if cell[2] < least[2] => Some([cell[0], cell[1], least[2]]),
                 () if cell[2] > most[2] => Some([cell[0], cell[1] + 1, least[2]]),
                 () => None,
             };
-            if let Some(target) = leap {
+            if let Some(target) = target {
                 next += self.cells[next..].partition_point(|cell| *cell < target);
                 continue;
             }

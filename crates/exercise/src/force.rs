@@ -22,14 +22,14 @@ const fn of_force(
 }
 
 pub(crate) const PEAK_FORCE: MeasureDefinition =
-    of_force("peak_force_n", "N", "max |F| over the steps", TREJOS, "How strong the tool was at most.");
+    of_force("peak_force_n", "N", "max |F| over the steps in contact", TREJOS, "How strong the tool was at most.");
 
 pub(crate) const MEAN_FORCE: MeasureDefinition = of_force(
     "mean_force_n",
     "N",
-    "∫|F|dt over the contact time",
+    "∫|F|dt divided by the contact time",
     TREJOS,
-    "How strong the tool was in the mean while it touched the tissue.",
+    "How strong the tool was on average while it touched the tissue.",
 );
 
 pub(crate) const FORCE_INTEGRAL: MeasureDefinition = of_force(

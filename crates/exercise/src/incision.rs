@@ -43,7 +43,7 @@ pub(crate) const GAPE: MeasureDefinition = of_cut(
     "gape_max_m",
     "m",
     f64::INFINITY,
-    "largest distance between the ends of a severed spring less that at rest, at the end; 0 without a cut",
+    "largest distance between the ends of a severed spring less that at rest, at the end",
     "How far the wound is open at its widest place.",
 );
 
@@ -51,7 +51,7 @@ pub(crate) const STITCHES: MeasureDefinition = of_cut(
     "stitches",
     "1",
     f64::INFINITY,
-    "threads and clips that hold at the end",
+    "threads and clips that hold at the end; with lines, those that cross one between two bites",
     "How many stitches and clips hold.",
 );
 
@@ -73,13 +73,24 @@ pub struct SeveredPlace {
     pub opening_m: f64,
 }
 
+/// Returns whether the straight way between two places crosses a line, seen along a direction.
+pub(crate) fn crosses(line: &TargetLine, ends_m: [DVec3; 2], seen_along: DVec3) -> bool {
+    // On which side of the way from `a` to `b` a place is.
+    let side = |a: DVec3, b: DVec3, place_m: DVec3| (b - a).cross(place_m - a).dot(seen_along) >= 0.0;
+    let [from_m, to_m] = ends_m;
+    line.points_m.windows(2).any(|part| {
+        side(part[0], part[1], from_m) != side(part[0], part[1], to_m)
+            && side(from_m, to_m, part[0]) != side(from_m, to_m, part[1])
+    })
+}
+
 /// Number of places of a line that are looked at.
 const LOOKS: usize = 200;
 
 /// Adds the figures of a cut; those of lines only if there are any.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn figures(lines: &[TargetLine], severed: &[SeveredPlace], seen_along: DVec3, figures: &mut Figures) {
-    let widest_m = severed.iter().map(|place| place.opening_m).fold(0.0, f64::max);
+    let widest_m = severed.iter().map(|place| place.opening_m.max(0.0)).reduce(f64::max);
     figures.add(&GAPE, widest_m);
     if lines.is_empty() {
         return;
@@ -143,6 +154,19 @@ mod tests {
     }
 
     #[test]
+    fn a_stitch_crosses_a_line_between_bites_on_both_sides_of_it() {
+        let line = TargetLine { points_m: vec![DVec3::ZERO, DVec3::new(0.03, 0.0, 0.0)], within_m: 0.002 };
+        let at = |x_m: f64, y_m: f64| DVec3::new(x_m, y_m, 0.1 * x_m);
+        for (ends_m, expected) in [
+            ([at(0.01, -0.004), at(0.012, 0.004)], true),
+            ([at(0.01, 0.002), at(0.012, 0.004)], false),
+            ([at(-0.01, -0.004), at(-0.01, 0.004)], false),
+        ] {
+            assert_eq!(crosses(&line, ends_m, DVec3::NEG_Z), expected, "{ends_m:?}");
+        }
+    }
+
+    #[test]
     fn a_cut_along_the_line_has_no_error_and_one_beside_it_has_its_distance() {
         let near = |severed: &[SeveredPlace], name: &str, expected: f64, tolerance: f64| {
             let value = value(severed, name).unwrap();
@@ -160,6 +184,7 @@ mod tests {
         near(&beside, "off_line_share", 1.0, 0.0);
         near(&beside, "line_cut_share", 0.0, 0.0);
         near(&[], "line_cut_share", 0.0, 0.0);
+        assert_eq!(value(&[], "gape_max_m"), None);
         assert_eq!(value(&[], "line_error_rms_m"), None);
     }
 }

@@ -98,7 +98,11 @@ impl Measures {
         let mut ended: Vec<WindowResult> = Vec::new();
         for (number, tool) in &mut self.tools {
             if rows.binary_search_by_key(number, |row| row.tool).is_err() {
-                ended.push(tool.leave());
+                let result = tool.leave();
+                let hands = &self.options.hands;
+                let is_of_hand = hands.is_empty() || hands.iter().any(|hand| hand.contains(number));
+                self.has_moved |= result.moves && is_of_hand;
+                ended.push(result);
             }
         }
         for row in rows {
@@ -106,10 +110,15 @@ impl Measures {
             tool.step(row, &self.options);
         }
         self.timeline.step(rows, self.options.force_limit_n);
-        self.has_moved |= ended.iter().any(|result| result.moves);
         if self.steps.is_multiple_of(window_steps(self.rate_hz)) {
-            let results: Vec<WindowResult> = self.tools.values_mut().map(ToolMeasures::end_window).collect();
-            let moves = self.has_moved || results.iter().any(|result| result.moves);
+            let hands = &self.options.hands;
+            let is_of_hand = |number: &u32| hands.is_empty() || hands.iter().any(|hand| hand.contains(number));
+            let (mut results, mut moves) = (Vec::new(), self.has_moved);
+            for (number, tool) in &mut self.tools {
+                let result = tool.end_window();
+                moves |= result.moves && is_of_hand(number);
+                results.push(result);
+            }
             self.idle_windows += u64::from(!moves);
             self.has_moved = false;
             ended.extend(results);

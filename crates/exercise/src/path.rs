@@ -32,7 +32,7 @@ pub(crate) const MEAN_SPEED: MeasureDefinition = MeasureDefinition {
     range: [0.0, f64::INFINITY],
     formula: "path length over the time in use",
     source: "Palpate",
-    meaning: "How fast the tool moved in the mean.",
+    meaning: "How fast the tool moved on average.",
 };
 
 pub(crate) const PEAK_SPEED: MeasureDefinition = MeasureDefinition {

@@ -31,7 +31,7 @@ pub(crate) const MEAN_PRESS_TIME: MeasureDefinition = of_presses(
     Scope::Tool,
     "s",
     "time of all presses over their number",
-    "How long a press took in the mean.",
+    "How long a press took on average.",
 );
 
 pub(crate) const SEARCH_TIME: MeasureDefinition = of_presses(

@@ -19,7 +19,7 @@ pub(crate) const AVOIDED_CONTACT: MeasureDefinition = of_task(
     "avoided_contact_s",
     "s",
     f64::INFINITY,
-    "time of all steps in which a tool in contact was in a region to avoid",
+    "time of all steps in which a tool in contact reached a region to avoid, seen along the exercise's direction: a disc with its radius",
     "How long something was touched that must not be.",
 );
 
@@ -27,7 +27,7 @@ pub(crate) const AVOIDED_FORCE: MeasureDefinition = of_task(
     "avoided_peak_force_n",
     "N",
     f64::INFINITY,
-    "largest |F| of a tool in a region to avoid",
+    "largest |F| of a tool that reached a region to avoid",
     "How hard something was touched that must not be.",
 );
 
@@ -35,7 +35,7 @@ pub(crate) const LIFT_HEIGHT: MeasureDefinition = of_task(
     "lift_height_m",
     "m",
     f64::INFINITY,
-    "largest displacement of the place that must be lifted",
+    "largest displacement of the place that must be lifted, against the exercise's direction",
     "How far the tissue was lifted.",
 );
 
@@ -59,7 +59,7 @@ pub struct AvoidedBall {
 /// A place that must be lifted, and for how long it must be held.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LiftTarget {
-    /// The displacement from which on it is lifted, m.
+    /// The displacement against the exercise's direction from which on it is lifted, m.
     pub height_m: f64,
     /// For how long, s.
     pub hold_s: f64,
@@ -68,6 +68,7 @@ pub struct LiftTarget {
 /// The tasks so far.
 #[derive(Debug, Clone, Default)]
 pub struct TaskMeasures {
+    seen_along: DVec3,
     avoided: Vec<AvoidedBall>,
     avoided_steps: u64,
     avoided_peak_n: f64,
@@ -78,17 +79,21 @@ pub struct TaskMeasures {
 }
 
 impl TaskMeasures {
-    /// Begins with the tasks of an exercise.
-    pub fn new(avoided: Vec<AvoidedBall>, lift: Option<LiftTarget>) -> Self {
-        TaskMeasures { avoided, lift, ..TaskMeasures::default() }
+    /// Begins with the tasks of an exercise. Distances along `seen_along`, a direction of length 1, do not count.
+    pub fn new(seen_along: DVec3, avoided: Vec<AvoidedBall>, lift: Option<LiftTarget>) -> Self {
+        TaskMeasures { seen_along, avoided, lift, ..TaskMeasures::default() }
     }
 
     /// Takes `steps` steps at whose ends the tools did what is in `rows`, and the place to lift was displaced by `lifted_m`, m.
     pub fn step(&mut self, rows: &[ToolRow], lifted_m: f64, steps: u64) {
         let is_inside = |row: &&ToolRow| {
             // The surface at rest below a disc; a tool without an area is where it is.
-            let place_m = row.disc.map_or(row.place_m, |disc| disc.rest_m);
-            row.is_in_contact && self.avoided.iter().any(|ball| ball.centre_m.distance(place_m) <= ball.radius_m)
+            let (place_m, reach_m) = row.disc.map_or((row.place_m, 0.0), |disc| (disc.rest_m, disc.radius_m));
+            let is_near = |ball: &AvoidedBall| {
+                let across_m = (place_m - ball.centre_m).reject_from_normalized(self.seen_along);
+                across_m.length() <= ball.radius_m + reach_m
+            };
+            row.is_in_contact && self.avoided.iter().any(is_near)
         };
         let hardest_n = rows.iter().filter(is_inside).map(|row| row.force_n.length()).reduce(f64::max);
         self.avoided_steps += if hardest_n.is_some() { steps } else { 0 };
@@ -126,10 +131,11 @@ mod tests {
     #[test]
     fn a_touch_of_an_avoided_region_counts_with_its_time_and_its_force() {
         let ball = AvoidedBall { centre_m: DVec3::new(0.05, 0.0, 0.0), radius_m: 0.01 };
-        let mut tasks = TaskMeasures::new(vec![ball], None);
+        let mut tasks = TaskMeasures::new(DVec3::NEG_Z, vec![ball], None);
         let at = |x_m: f64, is_in_contact: bool| ToolRow {
             tool: 0,
-            place_m: DVec3::new(x_m, 0.0, 0.0),
+            // However deep it is.
+            place_m: DVec3::new(x_m, 0.0, -0.2),
             force_n: 2.0 * x_m / 0.05 * DVec3::Z,
             is_in_contact,
             indentation_m: 0.0,
@@ -147,7 +153,7 @@ mod tests {
 
     #[test]
     fn only_the_longest_time_in_one_piece_is_held() {
-        let mut tasks = TaskMeasures::new(Vec::new(), Some(LiftTarget { height_m: 0.01, hold_s: 0.5 }));
+        let mut tasks = TaskMeasures::new(DVec3::NEG_Z, Vec::new(), Some(LiftTarget { height_m: 0.01, hold_s: 0.5 }));
         for (lifted_m, steps) in [(0.005, 100), (0.012, 150), (0.009, 1), (0.01, 200), (0.0, 10)] {
             tasks.step(&[], lifted_m, steps);
         }

@@ -22,8 +22,8 @@ pub struct ExerciseTruth {
     pub lines: Vec<TargetLine>,
     /// What is severed.
     pub severed: Vec<SeveredPlace>,
-    /// Number of threads and clips that hold.
-    pub stitches: usize,
+    /// The bites of threads and clips that hold, at rest, m.
+    pub stitches_m: Vec<Vec<DVec3>>,
 }
 
 impl ExerciseTruth {
@@ -35,7 +35,13 @@ impl ExerciseTruth {
             rules.judge(&self.targets, &self.answers).figures(&mut figures);
         }
         incision::figures(&self.lines, &self.severed, self.seen_along, &mut figures);
-        figures.add(&STITCHES, self.stitches as f64);
+        let crosses = |bites_m: &&Vec<DVec3>| {
+            let across = |ends: &[DVec3]| {
+                self.lines.iter().any(|line| incision::crosses(line, [ends[0], ends[1]], self.seen_along))
+            };
+            self.lines.is_empty() || bites_m.windows(2).any(across)
+        };
+        figures.add(&STITCHES, self.stitches_m.iter().filter(crosses).count() as f64);
         tasks.figures(rate_hz, &mut figures);
         figures.list
     }

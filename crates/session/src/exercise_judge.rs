@@ -8,9 +8,10 @@ use palpate_exercise::incision::{SeveredPlace, TargetLine};
 use palpate_exercise::tasks::{AvoidedBall, LiftTarget, TaskMeasures};
 use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, ToolRow, register};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean};
-use palpate_tissue::Model;
+use palpate_tissue::scene::action_check::check_free;
 use palpate_tissue::scene::exercise::{Criterion, Exercise, Lump};
-use palpate_tissue::shape::PointId;
+use palpate_tissue::shape::{PointId, RestShape};
+use palpate_tissue::{Model, TieState};
 
 /// Judges what is done in an exercise. Show it the session after each step, with the rows of its tools
 /// ([`MeasureRecorder::rows`](crate::measure_recorder::MeasureRecorder::rows)).
@@ -22,6 +23,11 @@ pub struct ExerciseJudge {
     lifted: Option<PointId>,
     begin_step: u64,
     newest: u64,
+    /// Number of severed springs, and the numbers of threads and clips, that were there at the beginning.
+    severed_before: usize,
+    ties_before: Vec<usize>,
+    /// Whether a tool has touched the tissue.
+    has_touched: bool,
 }
 
 /// A criterion of the score and what it earned.
@@ -48,28 +54,41 @@ impl ExerciseJudge {
     /// Begins an exercise at step `begin_step` of a session of this tissue, which has `lumps` ([`Exercise::lumps`]).
     ///
     /// # Errors
-    /// Refuses a criterion of a measure that does not exist.
+    /// Refuses a criterion of a measure that does not exist or that this exercise does not have, places off the tissue, and a fixed
+    /// place to lift.
     pub fn new(exercise: &Exercise, lumps: Vec<Lump>, model: &Model, begin_step: u64) -> Result<Self> {
-        check_criteria(exercise)?;
+        check_criteria(exercise)
+            .and_then(|()| check_places(exercise, model.shape()))
+            .map_err(|refusal| within(exercise, refusal))?;
         let avoided =
             exercise.avoid.iter().map(|ball| AvoidedBall { centre_m: ball.centre_m, radius_m: ball.radius_m });
         let lift = exercise.lift.map(|lift| LiftTarget { height_m: lift.height_m, hold_s: lift.hold_s });
         Ok(ExerciseJudge {
             lumps,
-            tasks: TaskMeasures::new(avoided.collect(), lift),
+            tasks: TaskMeasures::new(exercise.seen_along, avoided.collect(), lift),
             lifted: exercise.lift.map(|lift| model.shape().nearest(lift.place_m)),
             begin_step,
             newest: begin_step,
+            severed_before: 0,
+            ties_before: Vec::new(),
+            has_touched: false,
             exercise: exercise.clone(),
         })
     }
 
-    /// Takes the session at its present step, with the rows of its tools. Steps that were skipped at rest count as if nothing had
+    /// Takes the session at its present step, with the rows of its tools; the first time at its beginning, so that what was cut or tied
+    /// before does not count. Steps that were skipped at rest count as if nothing had
     /// changed in them.
     pub fn see(&mut self, session: &Session, rows: &[ToolRow]) {
         let step = session.step_count();
+        if step == self.begin_step {
+            self.severed_before = session.tissue().cuts().len();
+            self.ties_before = session.tissue().ties().iter().map(|tie| tie.number).collect();
+        }
+        self.has_touched |= rows.iter().any(|row| row.is_in_contact);
         if step > self.newest {
-            let lifted_m = self.lifted.map_or(0.0, |point| session.tissue().point(point).displacement_m.length());
+            let up = -self.exercise.seen_along;
+            let lifted_m = self.lifted.map_or(0.0, |point| session.tissue().point(point).displacement_m.dot(up));
             self.tasks.step(rows, lifted_m, step - self.newest);
             self.newest = step;
         }
@@ -143,46 +162,78 @@ impl ExerciseJudge {
             points_m: line.points_m.clone(),
             within_m: line.within_m,
         };
+        let holds = |tie: &&TieState| !tie.is_broken && !self.ties_before.contains(&tie.number);
+        let bites_m = |tie: &TieState| tie.tie.bites.iter().map(|bite| bite.place_m).collect();
         ExerciseTruth {
             seen_along,
             targets,
             rules,
             answers: session.marks().iter().map(answer).collect(),
             lines: self.exercise.lines.iter().map(line).collect(),
-            severed: severed(session),
-            stitches: session.tissue().ties().into_iter().filter(|tie| !tie.is_broken).count(),
+            severed: severed(session, self.severed_before),
+            stitches_m: session.tissue().ties().iter().filter(holds).map(bites_m).collect(),
         }
     }
 }
 
-/// Refuses a criterion whose measure does not exist.
+/// Returns a refusal with the name of the exercise.
+fn within(exercise: &Exercise, refusal: Refusal) -> Refusal {
+    Refusal { place: Some(format!("exercise {}", exercise.name)), ..refusal }
+}
+
+/// Refuses a criterion whose measure does not exist, or has no value in this exercise.
 fn check_criteria(exercise: &Exercise) -> Result<()> {
     for (index, criterion) in exercise.criteria.iter().enumerate() {
-        if register::find(&criterion.measure).is_none() {
+        let name = criterion.measure.as_str();
+        let field = format!("criterion[{index}].measure");
+        if register::find(name).is_none() {
             let names = register::definitions().map(|definition| definition.name);
-            let message =
-                format!("there is no measure `{}`{}", criterion.measure, did_you_mean(&criterion.measure, names));
-            return Err(Refusal::new(Reason::WrongKind, format!("criterion[{index}].measure"), message)
-                .within(&format!("exercise {}", exercise.name)));
+            let message = format!("there is no measure `{name}`{}", did_you_mean(name, names));
+            return Err(Refusal::new(Reason::WrongKind, field, message));
+        }
+        let (is_there, section) = match name {
+            "hits" | "misses" | "hits_share" | "false_alarms" | "d_prime" | "place_error_m" | "size_error_m" => {
+                (exercise.lumps.as_ref().is_some_and(|lumps| lumps.count[1] > 0), "[lumps] with a count above 0")
+            }
+            "line_cut_share" | "line_error_rms_m" | "off_line_share" => (!exercise.lines.is_empty(), "a [[line]]"),
+            "avoided_contact_s" | "avoided_peak_force_n" => (!exercise.avoid.is_empty(), "an [[avoid]]"),
+            "lift_height_m" | "held_share" => (exercise.lift.is_some(), "[lift]"),
+            "force_above_limit_share" => (exercise.limits.force_n.is_some(), "[limits] with force_n"),
+            _ => (true, ""),
+        };
+        if !is_there {
+            return Err(Refusal::new(Reason::Missing, field, format!("`{name}` needs {section}")));
         }
     }
     Ok(())
 }
 
-/// Returns the options with the limits of an exercise where they have none.
-pub fn with_limits(exercise: &Exercise, options: MeasureOptions) -> MeasureOptions {
-    let coverage_pa = exercise.coverage.map(|coverage| coverage.pressure_pa);
-    let is_default = options.coverage_pa.to_bits() == MeasureOptions::DEFAULT_COVERAGE_PA.to_bits();
+/// Refuses places that are not on the tissue.
+fn check_places(exercise: &Exercise, shape: &dyn RestShape) -> Result<()> {
+    for (index, line) in exercise.lines.iter().enumerate() {
+        line.points_m.iter().try_for_each(|place_m| shape.check_place(&format!("line[{index}].points_m"), *place_m))?;
+    }
+    for (index, ball) in exercise.avoid.iter().enumerate() {
+        shape.check_place(&format!("avoid[{index}].centre_m"), ball.centre_m)?;
+    }
+    let Some(lift) = exercise.lift else { return Ok(()) };
+    shape.check_place("lift.place_m", lift.place_m)?;
+    check_free("lift.place_m", shape, shape.nearest(lift.place_m))
+}
+
+/// Returns the thresholds of an exercise, where it gives any.
+pub fn thresholds(exercise: &Exercise) -> MeasureOptions {
+    let usual = MeasureOptions::default();
     MeasureOptions {
-        force_limit_n: options.force_limit_n.or(exercise.limits.force_n),
-        coverage_pa: coverage_pa.filter(|_| is_default).unwrap_or(options.coverage_pa),
+        force_limit_n: exercise.limits.force_n,
+        coverage_pa: exercise.coverage.map_or(usual.coverage_pa, |coverage| coverage.pressure_pa),
         seen_along: Some(exercise.seen_along),
-        ..options
+        ..usual
     }
 }
 
-/// Returns what is severed now, and how far it is open.
-fn severed(session: &Session) -> Vec<SeveredPlace> {
+/// Returns what is severed now beside the first `before` springs, and how far it is open.
+fn severed(session: &Session, before: usize) -> Vec<SeveredPlace> {
     let (tissue, model) = (session.tissue(), session.model());
     let shape = model.shape();
     let of = |joint: &palpate_tissue::SeveredJoint| {
@@ -191,5 +242,5 @@ fn severed(session: &Session) -> Vec<SeveredPlace> {
         let length_m = |ends: [DVec3; 2]| ends[0].distance(ends[1]);
         SeveredPlace { rest_m: rest_m[0].lerp(rest_m[1], joint.part), opening_m: length_m(now_m) - length_m(rest_m) }
     };
-    tissue.cuts().joints(model).iter().map(of).collect()
+    tissue.cuts().joints(model).iter().skip(before).map(of).collect()
 }

@@ -49,14 +49,17 @@ impl Intake {
             self.take_tip(tool);
         }
         let commands = handed.waiting.iter().filter(|(_, input)| matches!(input, Input::Command(_))).count();
-        let severs = |input: &Input| matches!(input, Input::Command(due) if may_sever(&due.command.action));
-        let has_room = self.make_room(commands).is_ok()
-            && (!handed.waiting.iter().any(|(_, input)| severs(input)) || self.charge_cuts("").is_ok());
+        let severs = |due: &Due| may_sever(&due.command.action);
+        let is_severing = |(_, input): &(u64, Input)| matches!(input, Input::Command(due) if severs(due));
+        let has_room = self.make_room(commands).is_ok();
+        let may_cut = !handed.waiting.iter().any(is_severing) || self.charge_cuts("").is_ok();
         let mut dropped = 0;
         for (step, input) in handed.waiting {
             let step = step.max(self.next_step);
             match input {
-                Input::Command(due) if has_room || due.ends_lease => self.await_again(step, due, now_ns),
+                Input::Command(due) if due.ends_lease || has_room && (may_cut || !severs(&due)) => {
+                    self.await_again(step, due, now_ns);
+                }
                 Input::Tissue(model) => {
                     let memory = Resource::Memory(Purpose::Change);
                     let taken =

@@ -51,6 +51,7 @@ use palpate_haptics::pose_playback::{Path, Play};
 use palpate_haptics::prediction::MAX_OTHERS;
 use palpate_haptics::{LocalModel, MotionState, OtherTool, Tip};
 use palpate_tissue::memory;
+use palpate_tissue::scene::action::MAX_MARKS;
 use palpate_tissue::scene::profile::{LoadProfile, MotionProfile, Poke};
 use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use palpate_tissue::scene::script::{Action, PlaceMark};
@@ -227,9 +228,6 @@ pub struct RecordedMark {
     /// The mark.
     pub mark: PlaceMark,
 }
-
-/// Largest number of marks that a session keeps.
-const MAX_MARKS: usize = 1024;
 
 impl Session {
     /// Creates a session of a tissue at rest, at step 0, without tools. It unwinds with a refusal if there is no

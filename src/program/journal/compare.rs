@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use palpate_exercise::MeasureOptions;
 use palpate_refusal::printable::printable;
 use palpate_tissue::files;
 
@@ -163,7 +164,7 @@ fn csv(compared: &[Compared]) -> String {
 /// Compares sessions.
 pub(super) fn compare(arguments: &CompareArguments) -> Result<(), Failure> {
     let CompareArguments { files, options, csv: file, config, quiet } = arguments;
-    let options = options.checked()?;
+    let options = options.checked(MeasureOptions::default())?;
     let mut compared = Vec::new();
     for path in files {
         let score = if is_journal(path) {
@@ -183,6 +184,11 @@ pub(super) fn compare(arguments: &CompareArguments) -> Result<(), Failure> {
     if let Some(other) = compared.iter().find(|one| one.score.thresholds != *first) {
         let name = &other.name;
         say!("palpate: warning: {name} has other thresholds than {}: not all figures compare", compared[0].name);
+    }
+    let of_exercise = |score: &Score| score.exercise.as_ref().map(|exercise| (exercise.name.clone(), exercise.seed));
+    if let Some(other) = compared.iter().find(|one| of_exercise(&one.score) != of_exercise(&compared[0].score)) {
+        let (name, first) = (&other.name, &compared[0].name);
+        say!("palpate: warning: {name} is of another exercise or seed than {first}: not all figures compare");
     }
     if let Some(file) = file {
         write_file(file, csv(&compared).as_bytes())?;

@@ -61,7 +61,9 @@ pub(super) fn measure(
     // Each step is a row, also where the tissue rests.
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
-    chosen.iter().for_each(|chosen| chosen.warn_of_scene(&model.scene.name));
+    if let Some(chosen) = chosen {
+        chosen.warn_of_scene(&model.scene.name);
+    }
     let mut recorder = ScoreRecorder::new(&model, begin, options, None, chosen)?;
     recorder.see(replay.session());
     let last = replay.survey().until_step;
@@ -97,8 +99,9 @@ pub(super) fn measure(
 /// Measures a journal, and writes the score.
 pub(super) fn score(arguments: &ScoreArguments) -> Result<(), Failure> {
     let ScoreArguments { source, options, exercise, json, output: file, report: page, quiet } = arguments;
+    let chosen = exercise.chosen()?;
     let MeasuredJournal { score, measures, damage } =
-        measure(source, options.checked()?, exercise.chosen()?.as_ref(), *quiet)?;
+        measure(source, options.checked(ChosenExercise::thresholds(chosen.as_ref()))?, chosen.as_ref(), *quiet)?;
     if let Some(page) = page {
         write_file(page, report::page(&score, &measures)?.as_bytes())?;
     }

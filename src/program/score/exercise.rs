@@ -1,17 +1,20 @@
 //! An exercise in a score: what was chosen, and what was earned by its criteria.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
-use palpate_exercise::Figure;
+use palpate_exercise::{Figure, MeasureOptions};
 use palpate_refusal::Refusal;
-use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore};
+use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, thresholds};
 use palpate_session::{RecordedMark, Session};
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::exercise::{Exercise, Lump};
 use palpate_tissue::scene::exercise_reader::find_exercise;
 use serde::{Deserialize, Serialize};
 
-use super::super::say;
+use super::super::scene::{SceneArguments, compile_with};
+use super::super::{Failure, say};
 
 /// Which exercise, with which hidden truth.
 #[derive(clap::Args)]
@@ -51,8 +54,30 @@ impl ExerciseOptions {
 
 impl ChosenExercise {
     /// Returns the assignments by which the scene gets the hidden lumps.
-    pub(crate) fn assignments(&self) -> Vec<String> {
+    fn assignments(&self) -> Vec<String> {
         self.exercise.assignments(&self.lumps)
+    }
+
+    /// Returns the thresholds of an exercise; the usual ones without an exercise.
+    pub(crate) fn thresholds(chosen: Option<&Self>) -> MeasureOptions {
+        chosen.map_or_else(MeasureOptions::default, |chosen| thresholds(&chosen.exercise))
+    }
+
+    /// Compiles the scene that the arguments name, with the exercise's changes if there is one. Returns it with the limits in force.
+    ///
+    /// # Errors
+    /// Refuses what [`compile_with`] refuses; a refusal of the exercise's changes names the exercise.
+    pub(crate) fn compile(chosen: Option<&Self>, scene: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
+        let Some(chosen) = chosen else { return compile_with(scene, &[]) };
+        let of_exercise = |failure: Failure| match failure {
+            Failure::Refused(message) if message.contains("inclusion") => {
+                Failure::Refused(format!("exercise {}: {message}", chosen.exercise.name))
+            }
+            other => other,
+        };
+        let compiled = compile_with(scene, &chosen.assignments()).map_err(of_exercise)?;
+        chosen.warn_of_scene(&compiled.0.scene.name);
+        Ok(compiled)
     }
 
     /// Warns if the exercise is made for other scenes than this one.

@@ -15,7 +15,7 @@ use palpate_refusal::printable::{printable, printable_json};
 use serde::{Deserialize, Serialize};
 
 use palpate_session::Session;
-use palpate_session::exercise_judge::{ExerciseJudge, with_limits};
+use palpate_session::exercise_judge::ExerciseJudge;
 use palpate_session::measure_recorder::MeasureRecorder;
 use palpate_tissue::Model;
 use palpate_tissue::scene::script::Script;
@@ -56,17 +56,17 @@ impl FromStr for HandTools {
 }
 
 impl ScoreOptions {
-    /// Returns the thresholds.
+    /// Returns the thresholds: those of the options, or else `usual`.
     ///
     /// # Errors
     /// Refuses what [`MeasureOptions::check`] refuses, with the option's name.
-    pub(crate) fn checked(&self) -> Result<MeasureOptions, Failure> {
+    pub(crate) fn checked(&self, usual: MeasureOptions) -> Result<MeasureOptions, Failure> {
         let options = MeasureOptions {
-            force_limit_n: self.force_limit_n,
-            coverage_pa: self.coverage_pa.unwrap_or(MeasureOptions::DEFAULT_COVERAGE_PA),
-            press_n: self.press_n.unwrap_or(MeasureOptions::DEFAULT_PRESS_N),
+            force_limit_n: self.force_limit_n.or(usual.force_limit_n),
+            coverage_pa: self.coverage_pa.unwrap_or(usual.coverage_pa),
+            press_n: self.press_n.unwrap_or(usual.press_n),
             hands: self.hand.iter().map(|hand| hand.0.clone()).collect(),
-            seen_along: None,
+            ..usual
         };
         let named = |refusal: Refusal| {
             let option = if refusal.field == "hands" { "hand".to_owned() } else { refusal.field.replace('_', "-") };
@@ -116,6 +116,9 @@ pub(crate) struct Thresholds {
     pub(crate) press_n: f64,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) hands: Vec<Vec<u32>>,
+    /// The direction against which the surface of the coverage faces; absent: all of it counts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) seen_along: Option<[f64; 3]>,
 }
 
 /// A figure in a score.
@@ -184,7 +187,6 @@ impl ScoreRecorder {
         continuous: Option<&Script>,
         chosen: Option<&ChosenExercise>,
     ) -> Result<Self, Refusal> {
-        let options = chosen.map_or(options.clone(), |chosen| with_limits(&chosen.exercise, options));
         let judge = |chosen: &ChosenExercise| {
             let judge = ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), model, begin_step)?;
             Ok::<_, Refusal>((judge, chosen.seed))
@@ -245,7 +247,8 @@ impl Score {
             let from_s = from_step.saturating_sub(1) as f64 / rate_hz;
             ScoredCrossing { tool, from_step, to_step, from_s, to_s: to_step as f64 / rate_hz, peak_n }
         };
-        let MeasureOptions { force_limit_n, coverage_pa, press_n, hands, .. } = measures.options().clone();
+        let MeasureOptions { force_limit_n, coverage_pa, press_n, hands, seen_along } = measures.options().clone();
+        let seen_along = seen_along.map(|direction| direction.to_array());
         let timeline = measures.timeline();
         Score {
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -253,7 +256,7 @@ impl Score {
             rate_hz,
             begin_step: measures.begin_step(),
             steps: measures.steps(),
-            thresholds: Thresholds { force_limit_n, coverage_pa, press_n, hands },
+            thresholds: Thresholds { force_limit_n, coverage_pa, press_n, hands, seen_along },
             measures: measures.figures().into_iter().chain(of_truth.iter().copied()).map(measure).collect(),
             limit_crossing_count: force_limit_n.map(|_| timeline.crossing_count()),
             limit_crossings: timeline.crossings().iter().map(crossing).collect(),

@@ -54,6 +54,47 @@ fn escaped(text: &str) -> String {
     safe
 }
 
+/// Returns the score of the exercise, and the truth beside the answers; nothing without an exercise.
+fn exercise(score: &Score) -> String {
+    let Some(exercise) = &score.exercise else { return String::new() };
+    let percent = exercise.score_percent.map_or_else(String::new, |percent| format!(": {percent:.0} %"));
+    let mut html = format!("<h2>Exercise {}, seed {}{percent}</h2>\n", escaped(&exercise.name), exercise.seed);
+    html +=
+        "<table><tr><th>criterion</th><th>value</th><th>poor</th><th>good</th><th>weight</th><th>earned</th></tr>\n";
+    for criterion in &exercise.criteria {
+        let [value, poor, good] = [criterion.value, Some(criterion.poor), Some(criterion.good)].map(shown);
+        let _ = writeln!(
+            html,
+            "<tr><td><code>{}</code></td><td>{value}</td><td>{poor}</td><td>{good}</td><td>{}</td><td>{:.0} %</td></tr>",
+            escaped(&criterion.measure),
+            criterion.weight,
+            100.0 * criterion.earned
+        );
+    }
+    html += "</table>\n";
+    let place = |[x, y, z]: [f64; 3]| format!("{:.1}, {:.1}, {:.1}", 1e3 * x, 1e3 * y, 1e3 * z);
+    if !exercise.lumps.is_empty() || !exercise.answers.is_empty() {
+        html += "<table><tr><th>hidden or marked</th><th>place, mm</th><th>diameter, mm</th><th></th></tr>\n";
+        for lump in &exercise.lumps {
+            let (at, diameter) = (place(lump.centre_m), 2e3 * lump.radius_m);
+            let times = shown(Some(lump.stiffness_factor));
+            let _ = writeln!(
+                html,
+                "<tr><td>lump</td><td>{at}</td><td>{diameter:.1}</td><td>{times} times as stiff</td></tr>"
+            );
+        }
+        for answer in &exercise.answers {
+            let diameter = shown(answer.diameter_m.map(|diameter_m| 1e3 * diameter_m));
+            #[allow(clippy::cast_precision_loss)]
+            let at_s = answer.step as f64 / score.rate_hz;
+            let at = place(answer.place_m);
+            let _ = writeln!(html, "<tr><td>mark</td><td>{at}</td><td>{diameter}</td><td>at {at_s:.3} s</td></tr>");
+        }
+        html += "</table>\n";
+    }
+    html
+}
+
 fn colour_of(tool: u32) -> &'static str {
     TOOL_COLOURS[tool as usize % TOOL_COLOURS.len()]
 }
@@ -70,6 +111,7 @@ pub(crate) fn page(score: &Score, measures: &Measures) -> Result<String, Failure
          <title>{title}</title><style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n<p class=\"of\">{}</p>\n",
         escaped(&about(score))
     );
+    html += &exercise(score);
     html += &figures(score);
     html += &curves(score, measures.timeline());
     html += &crossings(score);

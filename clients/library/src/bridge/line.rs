@@ -429,7 +429,8 @@ async fn connect(
                         }
                     }
                     // A datagram with the tip of before that the release has overtaken.
-                    Heard::Rejection(rejection) if rejection.sequence < newest_release => {}
+                    Heard::Rejection(rejection)
+                        if rejection.sequence < newest_release && rejection.reason == Reason::OutOfTurn.as_str() => {}
                     Heard::Rejection(rejection) => {
                         shared.inbound().traffic.refused += 1;
                         if rejection.reason == Reason::OutOfTurn.as_str() {

@@ -16,6 +16,9 @@ pub struct PlaceMark {
     pub diameter_m: Option<f64>,
 }
 
+/// Largest number of marks of a script, and that a session keeps.
+pub const MAX_MARKS: usize = 1024;
+
 /// An action of a tool, which lasts until its next action. Its numbers are not checked here: see
 /// [`action_check`](super::action_check).
 #[derive(Debug, Clone, PartialEq)]

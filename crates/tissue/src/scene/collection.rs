@@ -148,7 +148,7 @@ impl Collection {
         let hint = if self.names_files && is_name(name) && Path::new(&file).is_file() {
             format!("; did you mean the file `{file}`?")
         } else if others.has(name) {
-            format!("; `{name}` is a {}: {}", others.kind.name(), others.kind.advice())
+            format!("; `{name}` is {} {}: {}", others.kind.article(), others.kind.name(), others.kind.advice())
         } else {
             let meant = did_you_mean(name, names.iter().map(String::as_str));
             let own =

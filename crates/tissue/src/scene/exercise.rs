@@ -31,6 +31,8 @@ pub struct Exercise {
     pub instructions: String,
     /// The scenes for which it is made, in order of preference: at least one.
     pub scenes: Vec<String>,
+    /// Changes of the scene, `KEY=VALUE` each ([`Document::set`](super::toml_document::Document::set)).
+    pub set: Vec<String>,
     /// The seed of its hidden truth if nothing else gives one.
     pub seed: u64,
     /// The time that the trainee has, s: what is done later does not count. `None`: as long as it takes.
@@ -44,7 +46,7 @@ pub struct Exercise {
     pub lines: Vec<CutLine>,
     /// The regions of the surface that no tool may touch.
     pub avoid: Vec<AvoidedRegion>,
-    /// The fold that must be lifted.
+    /// The place that must be lifted and held.
     pub lift: Option<LiftTask>,
     /// How the surface must be pressed for a part of it to count as felt.
     pub coverage: Option<CoverageTask>,
@@ -107,7 +109,7 @@ pub struct AvoidedRegion {
 pub struct LiftTask {
     /// The place of the surface at rest, m.
     pub place_m: DVec3,
-    /// How far it must be from there, m.
+    /// How far it must be lifted from there, against `seen_along`, m.
     pub height_m: f64,
     /// For how long, s.
     pub hold_s: f64,
@@ -183,18 +185,19 @@ impl Exercise {
         self.lumps.as_ref().map_or(Some(Vec::new()), |hidden| hidden.drawn(seed))
     }
 
-    /// Returns the assignments by which a scene gets these lumps, in place of its own
-    /// ([`Document::set`](super::toml_document::Document::set)); none for an exercise without hidden lumps.
+    /// Returns the assignments by which a scene is changed ([`Document::set`](super::toml_document::Document::set)): those of the exercise,
+    /// and one by which the scene gets these lumps in place of its own, if the exercise hides any.
     pub fn assignments(&self, lumps: &[Lump]) -> Vec<String> {
-        if self.lumps.is_none() {
-            return Vec::new();
-        }
         let inclusion = |lump: &Lump| {
             let Lump { centre_m: DVec3 { x, y, z }, radius_m, stiffness_factor } = lump;
             format!(
                 "{{ centre_m = [{x:?}, {y:?}, {z:?}], radius_m = {radius_m:?}, stiffness_factor = {stiffness_factor:?} }}"
             )
         };
-        vec![format!("inclusion=[{}]", lumps.iter().map(inclusion).collect::<Vec<_>>().join(", "))]
+        let mut all = self.set.clone();
+        if self.lumps.is_some() {
+            all.push(format!("inclusion=[{}]", lumps.iter().map(inclusion).collect::<Vec<_>>().join(", ")));
+        }
+        all
     }
 }

@@ -56,6 +56,7 @@ fn read(fields: &mut Fields<'_>) -> Result<Exercise> {
         name,
         instructions: fields.required("instructions")?.text()?.trim().to_owned(),
         scenes: scenes(fields)?,
+        set: fields.item("set").map_or(Ok(Vec::new()), |item| item.list()?.iter().map(Item::text).collect())?,
         seed: fields.item("seed").map_or(Ok(1), |item| item.whole())?,
         time_limit_s: positive_or_none(fields, "time_limit_s")?,
         seen_along: seen_along(fields)?,
@@ -110,7 +111,7 @@ fn scenes(fields: &mut Fields<'_>) -> Result<Vec<String>> {
 }
 
 /// Reads a range: one number, or [least, most].
-fn range(fields: &mut Fields<'_>, key: &'static str, most: f64) -> Result<[f64; 2]> {
+fn range(fields: &mut Fields<'_>, key: &'static str, least: f64, most: f64) -> Result<[f64; 2]> {
     let item = fields.required(key)?;
     let ends = match item.number() {
         Ok(value) => [value; 2],
@@ -121,7 +122,7 @@ fn range(fields: &mut Fields<'_>, key: &'static str, most: f64) -> Result<[f64; 
     };
     let path = fields.path(key);
     for end in ends {
-        number(&path, end, &format!("above 0 and at most {most}"), |v| v > 0.0 && v <= most)?;
+        number(&path, end, &format!("from {least} to {most}"), |v| (least..=most).contains(&v))?;
     }
     if ends[0] > ends[1] {
         return Err(item.refuse(Reason::OutOfRange, "must be [least, most], but the first is larger"));
@@ -152,16 +153,23 @@ fn seen_along(fields: &mut Fields<'_>) -> Result<DVec3> {
     direction.ok_or_else(|| item.refuse(Reason::OutOfRange, "must not be 0: it is a direction"))
 }
 
-/// Largest radius of a lump, m.
+/// Smallest and largest radius of a lump, m.
+const MIN_RADIUS_M: f64 = 1e-6;
 const MAX_RADIUS_M: f64 = 1.0;
 
 fn lumps(fields: &mut Fields<'_>) -> Result<HiddenLumps> {
+    let from_m = fields.required("from_m")?.vector()?;
+    let to_m = fields.required("to_m")?.vector()?;
+    if from_m.cmpgt(to_m).any() {
+        let message = "must not be below `from_m` along any axis: they are the least and the greatest corner of a box";
+        return Err(fields.refuse(Reason::OutOfRange, "to_m", message));
+    }
     Ok(HiddenLumps {
         count: count(fields)?,
-        radius_m: range(fields, "radius_m", MAX_RADIUS_M)?,
-        stiffness_factor: range(fields, "stiffness_factor", 100.0)?,
-        from_m: fields.required("from_m")?.vector()?,
-        to_m: fields.required("to_m")?.vector()?,
+        radius_m: range(fields, "radius_m", MIN_RADIUS_M, MAX_RADIUS_M)?,
+        stiffness_factor: range(fields, "stiffness_factor", 0.01, 100.0)?,
+        from_m,
+        to_m,
         apart_m: distance(fields, "apart_m", 0.0)?,
         found_within_m: distance(fields, "found_within_m", 0.0)?,
     })

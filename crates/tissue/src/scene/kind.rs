@@ -30,6 +30,11 @@ impl TextKind {
         }
     }
 
+    /// Returns the article of that word.
+    pub(super) fn article(self) -> &'static str {
+        if self == TextKind::Exercise { "an" } else { "a" }
+    }
+
     /// Returns the advice for a text of this kind where another one is wanted.
     pub(super) fn advice(self) -> &'static str {
         match self {
@@ -56,15 +61,14 @@ impl TextKind {
 
     /// Returns the message for a text of `other` kind that lies in the folder of this kind.
     pub(super) fn misplaced(self, other: Self) -> String {
-        let other = other.name();
-        format!("is a {other} in the folder of {}s: move it to the folder of {other}s", self.name())
+        let (article, other) = (other.article(), other.name());
+        format!("is {article} {other} in the folder of {}s: move it to the folder of {other}s", self.name())
     }
 
     /// Refuses a document that has keys of another kind and none of this kind.
     pub(super) fn check(self, document: &Document) -> Result<()> {
         let Some(other) = self.mistaken(document) else { return Ok(()) };
-        let article = if other == TextKind::Exercise { "an" } else { "a" };
-        Err(document.refuse(Reason::WrongKind, format!("is {article} {}: {}", other.name(), other.advice())))
+        Err(document.refuse(Reason::WrongKind, format!("is {} {}: {}", other.article(), other.name(), other.advice())))
     }
 }
 

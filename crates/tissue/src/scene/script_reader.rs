@@ -11,7 +11,7 @@ use palpate_haptics::jaw_limit::MAX_JAW_TORQUE_LIMIT_N_M;
 use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Port, Tip, TipShape};
 
-use super::action::PlaceMark;
+use super::action::{MAX_MARKS, PlaceMark};
 use super::kind::TextKind;
 use super::profile::{
     CentreProfile, InstrumentProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile,
@@ -69,9 +69,6 @@ const SHORTEST_MOVE_S: f64 = 1e-6;
 
 /// The smallest allowed sum of the weights of a force with a radius.
 const MIN_WEIGHT: f64 = 1e-3;
-
-/// Largest number of marks of a script.
-const MAX_MARKS: usize = 1024;
 
 /// Highest frequency, Hz. Beyond it, a phase has no digits left.
 const HIGHEST_HZ: f64 = 1e6;
@@ -133,7 +130,7 @@ impl Binding<'_> {
             instruments.push(profile);
         }
         let ties = self.ties(fields)?;
-        let marks = self.marks(fields)?;
+        let marks = self.marks(fields, steps)?;
         control_points.extend(moves.iter().map(|profile| profile.point));
         // A row of tips would make many.
         let of_tools = poses.iter().filter(|profile: &&PoseProfile| profile.mounted.is_none());
@@ -615,12 +612,16 @@ impl Binding<'_> {
     }
 
     /// Reads the marks that a trainee makes.
-    fn marks(&mut self, fields: &mut Fields<'_>) -> Result<Vec<(u64, PlaceMark)>> {
+    fn marks(&mut self, fields: &mut Fields<'_>, steps: u64) -> Result<Vec<(u64, PlaceMark)>> {
         let mut marks = Vec::new();
         for item in items(fields, "mark")? {
             marks.push(item.table(|fields| {
                 let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
                 let step = self.steps(&fields.path("at_s"), at_s)?;
+                if step >= steps {
+                    let message = "must be before the script ends (duration_s)";
+                    return Err(fields.refuse(Reason::OutOfRange, "at_s", message));
+                }
                 let place_m = fields.required("place_m")?.place_in(self.scene.shape().dimensions())?;
                 let mark = PlaceMark { place_m, diameter_m: fields.number("diameter_m")? };
                 check_mark(fields.own_path(), self.scene.shape(), &mark)?;
