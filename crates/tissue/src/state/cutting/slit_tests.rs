@@ -53,11 +53,12 @@ fn surface(width: usize, jitter: f64) -> Arc<Model> {
     Model::compile(&scene, &Limits::default()).unwrap()
 }
 
-/// A slit of the half length c opens by 4·T₀·c/(E·t) in its middle (Inglis 1913). (The rim, 5 c from its middle, adds 2.4 %.)
+/// A slit of the half length c opens by 4·T₀·c/(E·t) in its middle (Inglis 1913). (A rim that is held makes it stiffer:
+/// 5 c from the middle by 7 %, 7 c by 4 %.)
 #[test]
 fn a_slit_opens_as_inglis_says_also_where_points_are_uneven() {
     let half: usize = std::env::var("PALPATE_CRACK_CELLS").map_or(10, |cells| cells.parse().unwrap());
-    let width = 10 * half;
+    let width = if half > 10 { 20 } else { 14 } * half;
     for jitter in if half > 10 { vec![0.0, 0.2] } else { vec![0.2] } {
         let model = surface(width, jitter);
         let mut tissue = at_rest(&model);
