@@ -4,7 +4,7 @@
 //! the origin along −x, and jaws run from their hinge along x. They turn about the axis along z through the hinge, each by half of
 //! the angle between them: the upper jaw towards y, the lower one towards −y.
 //!
-//! **Forces.** The force of a tip acts at the tip's place. An instrument's wrench is the sum of its tips' forces and of their torques
+//! **Forces.** The force of a tip acts at the tip's place; that on a blade where its edge pierces the surface ([`TipForce`]). An instrument's wrench is the sum of its tips' forces and of their torques
 //! about the instrument's place.
 
 use glam::{DQuat, DVec3};
@@ -63,6 +63,24 @@ pub struct InstrumentTip {
     pub tip: Tip,
     /// What it belongs to.
     pub part: InstrumentPart,
+}
+
+/// The force of the tissue on a tip of an instrument.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TipForce {
+    /// The tip's number.
+    pub tip: usize,
+    /// The force on it, N, in the tissue's frame.
+    pub force_n: DVec3,
+    /// From the tip's place to where the force acts, m: 0, except for a blade, on which it acts where the edge pierces the surface.
+    pub lever_m: DVec3,
+}
+
+impl From<(usize, DVec3)> for TipForce {
+    /// Returns a force that acts at the place of a tip, from its number and the force, N.
+    fn from((tip, force_n): (usize, DVec3)) -> Self {
+        TipForce { tip, force_n, lever_m: DVec3::ZERO }
+    }
 }
 
 /// A rigid set of tips, with or without jaws.
@@ -222,22 +240,22 @@ impl Instrument {
         (pose.orientation * DVec3::Z, pose.place_m + pose.orientation * self.hinge_m)
     }
 
-    /// Returns the wrench of forces on the tips (number and N, in the tissue's frame) about the instrument's place.
-    pub fn wrench(&self, pose: &InstrumentPose, forces_n: impl IntoIterator<Item = (usize, DVec3)>) -> Wrench {
-        forces_n.into_iter().fold(Wrench::default(), |sum, (number, force_n)| Wrench {
+    /// Returns the wrench of forces on the tips about the instrument's place.
+    pub fn wrench(&self, pose: &InstrumentPose, forces: impl IntoIterator<Item = impl Into<TipForce>>) -> Wrench {
+        forces.into_iter().map(Into::into).fold(Wrench::default(), |sum, TipForce { tip, force_n, lever_m }| Wrench {
             force_n: sum.force_n + force_n,
-            torque_n_m: sum.torque_n_m + (self.tip_m(number, pose) - pose.place_m).cross(force_n),
+            torque_n_m: sum.torque_n_m + (self.tip_m(tip, pose) + lever_m - pose.place_m).cross(force_n),
         })
     }
 
-    /// Returns the torque with which forces on the tips (number and N, in the tissue's frame) open the jaws, N·m: half the difference
+    /// Returns the torque with which forces on the tips open the jaws, N·m: half the difference
     /// of the torques on both jaws about their hinge, so that its product with the angle's velocity is their power.
-    pub fn opening_n_m(&self, pose: &InstrumentPose, forces_n: impl IntoIterator<Item = (usize, DVec3)>) -> f64 {
+    pub fn opening_n_m(&self, pose: &InstrumentPose, forces: impl IntoIterator<Item = impl Into<TipForce>>) -> f64 {
         let (axis, hinge_m) = self.hinge(pose);
-        let of = |(number, force_n): (usize, DVec3)| {
-            self.tips[number].part.turn() * (self.tip_m(number, pose) - hinge_m).cross(force_n).dot(axis)
+        let of = |TipForce { tip, force_n, lever_m }: TipForce| {
+            self.tips[tip].part.turn() * (self.tip_m(tip, pose) + lever_m - hinge_m).cross(force_n).dot(axis)
         };
-        forces_n.into_iter().map(of).sum()
+        forces.into_iter().map(Into::into).map(of).sum()
     }
 }
 

@@ -83,7 +83,7 @@ pub use deadband::ForceDeadband;
 pub use device::Device;
 pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use force_law::Law;
-pub use instrument::{Instrument, InstrumentPart, InstrumentTip};
+pub use instrument::{Instrument, InstrumentPart, InstrumentTip, TipForce};
 pub use instrument_contact::{ContactLoad, InstrumentContact, OtherInstrument, SecondHand};
 pub use instrument_pose::{InstrumentPose, InstrumentVelocity, Wrench};
 pub use instrument_renderer::{InstrumentRenderer, WrenchSample};

@@ -206,8 +206,7 @@ impl LedInstrument {
     ) -> Option<InstrumentSample> {
         let SeenPose { client_time_s, pose, .. } = self.seen?.1;
         let tips = sample.tools.iter().filter_map(|tool| Some((self.tip(tool.tool)?, tool)));
-        let forces_n: Vec<_> =
-            tips.filter_map(|(tip, tool)| Some((tip, tool.feel.as_ref()?.force_on_tool_n))).collect();
+        let forces_n: Vec<_> = tips.filter_map(|(tip, tool)| Some(tool.feel.as_ref()?.force_on_tip(tip))).collect();
         let forces_n = || forces_n.iter().copied();
         let LedInstrument { instrument, first_tool, contact, jaws, .. } = self;
         contact.begin();

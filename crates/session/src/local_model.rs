@@ -179,6 +179,7 @@ mod tests {
             velocity_m_per_s: DVec3::ZERO,
             contact_state,
             force_on_tool_n: DVec3::ZERO,
+            lever_m: DVec3::ZERO,
             surface_m: surface_m * DVec3::Z,
             touching_m: surface_m * DVec3::Z,
             anchor_m: DVec3::ZERO,

@@ -33,7 +33,7 @@ const MAX_BEHIND_S: f64 = 0.005;
 /// The work that a tool which is led by poses has done on a tissue.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ToolWork {
-    /// Place of the tool, m, and the force on it, N, after the last step.
+    /// Where the force on the tool acts, m, and that force, N, after the last step.
     before: Option<(DVec3, DVec3)>,
     /// The work so far, J: negative if the tool got more energy than it gave.
     pub done_j: f64,
@@ -43,7 +43,7 @@ impl ToolWork {
     /// Adds the work of a step, after which `contact` is what the tool feels: the mean of the forces before and after it times
     /// the way.
     pub fn add(&mut self, contact: Option<ToolContact>) {
-        let now = contact.map(|felt| (felt.place_m, felt.force_on_tool_n));
+        let now = contact.map(|felt| (felt.place_m + felt.lever_m, felt.force_on_tool_n));
         if let (Some((from_m, from_n)), Some((to_m, to_n))) = (self.before, now) {
             self.done_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
         }
@@ -245,8 +245,8 @@ impl Predictor for TissueCopy {
         self.step_to(now_s, pose, others)?;
         let tissue = self.session.tissue();
         let felt = || (0..self.work.len()).filter_map(|tool| Some((tool, tissue.tool_contact(tool)?)));
-        let forces_n = felt().map(|(tool, contact)| (tool, contact.force_on_tool_n));
-        let wrench = self.instrument.wrench(&self.instrument.lead(pose), forces_n);
+        let forces = felt().map(|(tool, contact)| contact.force_on_tip(tool));
+        let wrench = self.instrument.wrench(&self.instrument.lead(pose), forces);
         // A tip that holds, sticks or slides says so for all.
         let touching = felt().map(|(_, contact)| contact.contact_state).find(|state| *state != ContactState::Free);
         let [own_work_j, others_work_j] =

@@ -208,6 +208,7 @@ impl Tool {
             velocity_m_per_s: self.velocity_m_per_s,
             contact_state: self.contact_state,
             force_on_tool_n: felt_n,
+            lever_m: self.pierced_m * self.from_edge_m.normalize_or_zero(),
             surface_m,
             touching_m: surface_m + self.tip.shape.height_m(self.tip.radius_m) * self.normal,
             anchor_m: self.footprint.anchor_m(),

@@ -64,7 +64,7 @@ use crate::scene::tie::Tie;
 use crate::tools::burns::Burns;
 use crate::tools::rigid_tip::RigidTip;
 use crate::tools::tie::Ties;
-use palpate_haptics::{ContactState, Coupling, Tip, TipShape};
+use palpate_haptics::{ContactState, Coupling, Tip, TipForce, TipShape};
 use palpate_refusal::Result;
 
 /// If the determinant of a scheme's impulse and constant force is below this, the scheme has one unknown, not
@@ -96,6 +96,8 @@ pub struct ToolContact {
     pub contact_state: ContactState,
     /// Force of the tissue on the tool, N; 0 while it is free.
     pub force_on_tool_n: DVec3,
+    /// From the tool's place to where that force acts on it, m: 0, except for a blade, on which it acts where the edge pierces the surface.
+    pub lever_m: DVec3,
     /// Place of the displaced surface under the tool, m: the middle of its disc.
     pub surface_m: DVec3,
     /// Place of the tool at which it would just touch that surface, m: of a sphere, a radius above it.
@@ -111,6 +113,13 @@ pub struct ToolContact {
     /// Whether the disc lies almost wholly on fixed points ([`Footprint::is_on_fixed`]), so that its force is
     /// not that of free tissue.
     pub is_on_fixed: bool,
+}
+
+impl ToolContact {
+    /// Returns the force on the tool, which is a tip of an instrument.
+    pub fn force_on_tip(&self, tip: usize) -> TipForce {
+        TipForce { tip, force_n: self.force_on_tool_n, lever_m: self.lever_m }
+    }
 }
 
 /// A copy of the tissue around a tool at one step, from which another thread computes the stiffness there while the
@@ -724,6 +733,11 @@ impl Tool {
             return rigid.stored_j();
         }
         match self.coupling() {
+            Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() && self.tip.shape == TipShape::Blade => {
+                // Along its edge a blade slides freely, and what it cannot hold has slid.
+                let edge = self.from_edge_m.normalize_or_zero();
+                0.5 * stiffness_n_per_m * (place_m - surface_m).reject_from(edge).length_squared()
+            }
             Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
                 let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();
                 // A disc that lags behind stretches nothing along its path.
