@@ -251,5 +251,49 @@ fn an_exercise_is_judged_by_its_truth_and_another_seed_hides_something_else() {
     ] {
         says(palpate(folder.path(), &["check", "liver", "--exercise", exercise]), 2, &[part]);
     }
-    says(palpate(folder.path(), &["check", "liver", "--exercise", "lumps-1"]), 0, &["made for phantom"]);
+    says(palpate(folder.path(), &["check", "liver", "--exercise", "lumps-1"]), 2, &["exercise lumps-1", "inclusion"]);
+    says(palpate(folder.path(), &["check", "fibrotic", "--exercise", "cut-line"]), 0, &["made for liver"]);
+}
+
+/// A blade along the line of `close-wound`, and three stitches across it.
+fn cut_and_sewn() -> String {
+    let upright = "orientation = [0.70710678, 0, 0.70710678, 0]";
+    let mut text =
+        "duration_s = 3.0\nsample_every_s = 0.5\n[[tool]]\nblade = { length_m = 0.02 }\nuntil_s = 1.3\nposes = [\n"
+            .to_owned();
+    for (at_s, y, z) in [(0.0, 0.0205, 0.004), (0.2, 0.0205, -0.006), (1.1, 0.056, -0.006), (1.25, 0.056, 0.004)] {
+        text += &format!("{{ at_s = {at_s}, place_m = [0.03625, {y}, {z}], {upright} }},\n");
+    }
+    text += "]\n";
+    for y in [0.0295, 0.0375, 0.0455] {
+        text += &format!(
+            "[[thread]]\nbites = [{{ place_m = [0.03225, {y}, 0], radius_m = 0.002 }}, {{ place_m = [0.04025, {y}, 0], radius_m = 0.002 }}]\n\
+             length_m = [{{ at_s = 1.4, length_m = 0.014 }}, {{ at_s = 1.9, length_m = 0.0075 }}]\n"
+        );
+    }
+    text
+}
+
+#[test]
+fn who_does_what_an_exercise_asks_earns_it_and_who_does_not_earns_little() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("sew.toml"), cut_and_sewn()).unwrap();
+    let percent = |scene: &str, script: &str, exercise: &str| {
+        let run = ["run", scene, script, "--quiet", "--output", "r.jsonl", "--exercise", exercise, "--score", "s.json"];
+        says(palpate(folder.path(), &run), 0, &[]);
+        let text = std::fs::read_to_string(folder.path().join("s.json")).unwrap();
+        let score: serde_json::Value = serde_json::from_str(&text).unwrap();
+        (score["exercise"]["score_percent"].as_f64().unwrap(), score)
+    };
+    for (scene, script, exercise, range) in [
+        ("liver", "cut", "cut-line", 95.0..=100.0),
+        ("liver", "press", "cut-line", 0.0..=30.0),
+        ("liver", "sew.toml", "close-wound", 95.0..=100.0),
+        ("liver", "cut", "close-wound", 0.0..=30.0),
+        ("liver-solid", "lift", "lift-hold", 95.0..=100.0),
+        ("liver", "grasp", "cut-line", 0.0..=30.0),
+    ] {
+        let (percent, score) = percent(scene, script, exercise);
+        assert!(range.contains(&percent), "{script} earns {percent} % of {exercise}: {score}");
+    }
 }

@@ -6,7 +6,6 @@ use glam::DVec3;
 
 use crate::body::MemoryLayout;
 use crate::body::Places;
-use crate::body::severed::SeveredSpring;
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::real::Real;
 use crate::scene::graph::GraphFault;
@@ -205,14 +204,6 @@ impl Model {
     pub fn session_bytes(&self) -> u64 {
         const STATES: u64 = 3;
         STATES * self.state_bytes() + self.bytes()
-    }
-
-    /// Returns the memory that severed springs of a session may take, bytes: three lists of all springs (its own, the
-    /// guard's checkpoint's, and the one that others read), and their marks. Sheets and surfaces have no more springs
-    /// to sever; in a solid the doubled corners come from the spare places of a state.
-    pub fn cut_bytes(&self) -> u64 {
-        const LISTS: u64 = 3;
-        LISTS * (self.end_count() as u64 / 2) * size_of::<SeveredSpring>() as u64 + self.end_count() as u64 / 8
     }
 
     /// Returns the memory of one state of a tissue, bytes: three components of u, d and the scheme's kept

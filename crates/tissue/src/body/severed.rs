@@ -214,6 +214,16 @@ impl Cuts {
     }
 }
 
+impl Model {
+    /// Returns the memory that severed springs of a session may take, bytes: three lists of all springs (its own, the
+    /// guard's checkpoint's, and the one that others read), and their marks. Sheets and surfaces have no more springs
+    /// to sever; in a solid the doubled corners come from the spare places of a state.
+    pub fn cut_bytes(&self) -> u64 {
+        const LISTS: u64 = 3;
+        LISTS * (self.end_count() as u64 / 2) * size_of::<SeveredSpring>() as u64 + self.end_count() as u64 / 8
+    }
+}
+
 /// The severed springs of a tissue, and at which ends of springs they are.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Severed {

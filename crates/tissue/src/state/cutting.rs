@@ -293,13 +293,7 @@ impl<T: Real> TissueState<T> {
 }
 
 mod burning;
-#[cfg(test)]
-mod energy_tests;
 mod faces;
-#[cfg(test)]
-mod press_tests;
-#[cfg(test)]
-mod slit_tests;
 mod tearing;
 #[cfg(test)]
 mod tests;

@@ -46,8 +46,10 @@ impl Tool {
         self.side = Some(1.0);
         let below_m = (surface_m - place_m).dot(self.normal);
         let depth_m = (below_m / edge.dot(self.normal).max(MIN_SLOPE)).min(length_m);
-        self.pierced_m = depth_m.max(0.0);
+        // Across the edge from the middle of the disc: where an edge leans on the surface, that is not where it leaves it.
+        self.pierced_m = (surface_m - place_m).dot(edge);
         let most_n = model.scene.cutting.resistance_n(depth_m);
+        self.resistance_n = most_n;
         let pierced_m = place_m + depth_m * edge;
         let is_beside = self.footprint.is_beside(pierced_m - surface_m, self.normal);
         if below_m <= 0.0 || is_beside || most_n <= 0.0 || self.footprint.relative_inverse_mass() == 0.0 {

@@ -153,8 +153,10 @@ pub(crate) struct Tool {
     pub(crate) to_m: DVec3,
     /// The edge of a blade at the step's beginning, m; that at its end is the tip's.
     pub(crate) from_edge_m: DVec3,
-    /// How far along its edge from the tip a blade pierces the surface, m; found anew in each substep.
+    /// How far along its edge from the tip the force on a blade acts, m; found anew in each substep.
     pub(crate) pierced_m: f64,
+    /// The most that its coupling bears at that depth, N; found with it.
+    pub(crate) resistance_n: f64,
     pub(crate) contact_state: ContactState,
     /// Normal of the surface under the disc, on the tool's side.
     pub(crate) normal: DVec3,
@@ -228,6 +230,7 @@ impl Contacts {
             to_m,
             from_edge_m: tip.edge_m,
             pierced_m: 0.0,
+            resistance_n: 0.0,
             contact_state: ContactState::Free,
             normal: DVec3::Z,
             side: None,
@@ -411,6 +414,7 @@ impl Tool {
             to_m: checks.vector(saved.to_m)?,
             from_edge_m: checks.vector(saved.from_edge_m)?,
             pierced_m: 0.0,
+            resistance_n: 0.0,
             contact_state: contact_state.unwrap_or(ContactState::Free),
             normal: checks.vector(saved.normal)?,
             side,
@@ -583,7 +587,7 @@ impl Tool {
         if lags && self.tip.coupling == Coupling::Constraint && !self.tip.grasps { across_m } else { DVec3::ZERO }
     }
 
-    /// Returns the movement of the tool in a substep, m: of a blade, that of the place of its edge which pierces the surface. This one also
+    /// Returns the movement of the tool in a substep, m: of a blade, that of the place of its edge on which the force acts. This one also
     /// moves as the edge turns, and there the blade works.
     pub(crate) fn own_movement_m(&self, model: &Model, plan: &Plan) -> DVec3 {
         let mut moved_m = self.to_m - self.from_m;
@@ -734,9 +738,12 @@ impl Tool {
         }
         match self.coupling() {
             Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() && self.tip.shape == TipShape::Blade => {
-                // Along its edge a blade slides freely, and what it cannot hold has slid.
+                // Along its edge a blade slides freely. Beyond its resistance the place of the tissue lags behind where the spring would
+                // hold it, because the displacement differs there: that stretches nothing.
                 let edge = self.from_edge_m.normalize_or_zero();
-                0.5 * stiffness_n_per_m * (place_m - surface_m).reject_from(edge).length_squared()
+                let stretched_m = (place_m - surface_m).reject_from(edge).length();
+                let held_m = stretched_m.min(self.resistance_n / stiffness_n_per_m);
+                0.5 * stiffness_n_per_m * held_m * held_m
             }
             Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
                 let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();

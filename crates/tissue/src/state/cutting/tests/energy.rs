@@ -75,11 +75,6 @@ fn the_work_of_a_blade_is_that_of_separation_and_what_the_tissue_keeps_or_loses_
         let coupled_j = tissue.contacts.coupling_j(&model, &tissue.tables.layout, &tissue.state);
         let kept_j = energy.kinetic_j + energy.spring_j + energy.anchor_j + coupled_j;
         let fracture_j = tissue.cuts().fracture_j();
-        println!(
-            "{kind}: work {work_j:e}, fracture {fracture_j:e}, kept {kept_j:e}, damped {damped_j:e} J, {} severed, {} substeps",
-            tissue.cuts().len(),
-            tissue.plan.substeps
-        );
         assert!(fracture_j > 0.5 * work_j && tissue.cuts().len() > 5, "{kind}: {fracture_j} J of {work_j} J");
         let found_j = fracture_j + kept_j + damped_j;
         assert!((found_j / work_j - 1.0).abs() < 0.01, "{kind}: {found_j} J of {work_j} J");

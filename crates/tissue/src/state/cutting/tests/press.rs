@@ -1,6 +1,7 @@
-//! Tests of a press beside a slit, against references that are solved by other means: for sheets and surfaces the balance of the springs
-//! that the slit leaves, for solids finite elements of the usual kind (eight corners, 2³ points of integration) in which only cells with
-//! a whole face between them share its corners.
+//! Tests of a press beside a slit, against references that are solved by other means.
+//!
+//! For sheets and surfaces it is the balance of the springs that the slit leaves, for solids finite elements of the usual kind (eight
+//! corners, 2³ points of integration) in which only cells with a whole face between them share its corners.
 #![allow(clippy::unwrap_used, clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 
 use std::sync::Arc;
