@@ -2,20 +2,10 @@
 
 use glam::{DVec2, DVec3};
 
-use crate::definition::{Figures, MeasureDefinition, Scope};
+use crate::definition::{Figures, MeasureDefinition};
 use crate::detection::{D_PRIME, d_prime};
 
-const fn of_answers(
-    name: &'static str,
-    unit: &'static str,
-    most: f64,
-    formula: &'static str,
-    meaning: &'static str,
-) -> MeasureDefinition {
-    MeasureDefinition { name, unit, scope: Scope::Total, range: [0.0, most], formula, source: "Palpate", meaning }
-}
-
-pub(crate) const HITS: MeasureDefinition = of_answers(
+pub(crate) const HITS: MeasureDefinition = MeasureDefinition::of_truth(
     "hits",
     "1",
     f64::INFINITY,
@@ -24,10 +14,15 @@ pub(crate) const HITS: MeasureDefinition = of_answers(
     "How many hidden lumps were found.",
 );
 
-pub(crate) const MISSES: MeasureDefinition =
-    of_answers("misses", "1", f64::INFINITY, "targets that are not hits", "How many hidden lumps were not found.");
+pub(crate) const MISSES: MeasureDefinition = MeasureDefinition::of_truth(
+    "misses",
+    "1",
+    f64::INFINITY,
+    "targets that are not hits",
+    "How many hidden lumps were not found.",
+);
 
-pub(crate) const HITS_SHARE: MeasureDefinition = of_answers(
+pub(crate) const HITS_SHARE: MeasureDefinition = MeasureDefinition::of_truth(
     "hits_share",
     "1",
     1.0,
@@ -35,7 +30,7 @@ pub(crate) const HITS_SHARE: MeasureDefinition = of_answers(
     "Which share of the hidden lumps was found.",
 );
 
-pub(crate) const FALSE_ALARMS: MeasureDefinition = of_answers(
+pub(crate) const FALSE_ALARMS: MeasureDefinition = MeasureDefinition::of_truth(
     "false_alarms",
     "1",
     f64::INFINITY,
@@ -43,7 +38,7 @@ pub(crate) const FALSE_ALARMS: MeasureDefinition = of_answers(
     "How many marks were at places without a lump.",
 );
 
-pub(crate) const PLACE_ERROR: MeasureDefinition = of_answers(
+pub(crate) const PLACE_ERROR: MeasureDefinition = MeasureDefinition::of_truth(
     "place_error_m",
     "m",
     f64::INFINITY,
@@ -51,7 +46,7 @@ pub(crate) const PLACE_ERROR: MeasureDefinition = of_answers(
     "How far the marks were from the lumps that they found.",
 );
 
-pub(crate) const SIZE_ERROR: MeasureDefinition = of_answers(
+pub(crate) const SIZE_ERROR: MeasureDefinition = MeasureDefinition::of_truth(
     "size_error_m",
     "m",
     f64::INFINITY,

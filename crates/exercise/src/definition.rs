@@ -30,6 +30,19 @@ pub struct MeasureDefinition {
     pub meaning: &'static str,
 }
 
+impl MeasureDefinition {
+    /// Returns a measure of all tools that needs the truth of an exercise, from 0 to `most`.
+    pub(crate) const fn of_truth(
+        name: &'static str,
+        unit: &'static str,
+        most: f64,
+        formula: &'static str,
+        meaning: &'static str,
+    ) -> Self {
+        MeasureDefinition { name, unit, scope: Scope::Total, range: [0.0, most], formula, source: "Palpate", meaning }
+    }
+}
+
 /// The value of a measure. A measure without a defined value, such as the mean force without a contact, has no figure; a
 /// value is always finite.
 #[derive(Debug, Clone, Copy, PartialEq)]

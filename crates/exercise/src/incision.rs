@@ -3,19 +3,9 @@
 use glam::DVec3;
 
 use crate::answers::from_line_m;
-use crate::definition::{Figures, MeasureDefinition, Scope};
+use crate::definition::{Figures, MeasureDefinition};
 
-const fn of_cut(
-    name: &'static str,
-    unit: &'static str,
-    most: f64,
-    formula: &'static str,
-    meaning: &'static str,
-) -> MeasureDefinition {
-    MeasureDefinition { name, unit, scope: Scope::Total, range: [0.0, most], formula, source: "Palpate", meaning }
-}
-
-pub(crate) const LINE_CUT_SHARE: MeasureDefinition = of_cut(
+pub(crate) const LINE_CUT_SHARE: MeasureDefinition = MeasureDefinition::of_truth(
     "line_cut_share",
     "1",
     1.0,
@@ -23,7 +13,7 @@ pub(crate) const LINE_CUT_SHARE: MeasureDefinition = of_cut(
     "Which share of the line was cut.",
 );
 
-pub(crate) const LINE_ERROR: MeasureDefinition = of_cut(
+pub(crate) const LINE_ERROR: MeasureDefinition = MeasureDefinition::of_truth(
     "line_error_rms_m",
     "m",
     f64::INFINITY,
@@ -31,7 +21,7 @@ pub(crate) const LINE_ERROR: MeasureDefinition = of_cut(
     "How far the cut is from the line.",
 );
 
-pub(crate) const OFF_LINE_SHARE: MeasureDefinition = of_cut(
+pub(crate) const OFF_LINE_SHARE: MeasureDefinition = MeasureDefinition::of_truth(
     "off_line_share",
     "1",
     1.0,
@@ -39,7 +29,7 @@ pub(crate) const OFF_LINE_SHARE: MeasureDefinition = of_cut(
     "Which share of the cut is beside the line.",
 );
 
-pub(crate) const GAPE: MeasureDefinition = of_cut(
+pub(crate) const GAPE: MeasureDefinition = MeasureDefinition::of_truth(
     "gape_max_m",
     "m",
     f64::INFINITY,
@@ -47,7 +37,7 @@ pub(crate) const GAPE: MeasureDefinition = of_cut(
     "How far the wound is open at its widest place.",
 );
 
-pub(crate) const STITCHES: MeasureDefinition = of_cut(
+pub(crate) const STITCHES: MeasureDefinition = MeasureDefinition::of_truth(
     "stitches",
     "1",
     f64::INFINITY,

@@ -2,20 +2,10 @@
 
 use glam::DVec3;
 
-use crate::definition::{Figures, MeasureDefinition, Scope};
+use crate::definition::{Figures, MeasureDefinition};
 use crate::input::ToolRow;
 
-const fn of_task(
-    name: &'static str,
-    unit: &'static str,
-    most: f64,
-    formula: &'static str,
-    meaning: &'static str,
-) -> MeasureDefinition {
-    MeasureDefinition { name, unit, scope: Scope::Total, range: [0.0, most], formula, source: "Palpate", meaning }
-}
-
-pub(crate) const AVOIDED_CONTACT: MeasureDefinition = of_task(
+pub(crate) const AVOIDED_CONTACT: MeasureDefinition = MeasureDefinition::of_truth(
     "avoided_contact_s",
     "s",
     f64::INFINITY,
@@ -23,7 +13,7 @@ pub(crate) const AVOIDED_CONTACT: MeasureDefinition = of_task(
     "How long something was touched that must not be.",
 );
 
-pub(crate) const AVOIDED_FORCE: MeasureDefinition = of_task(
+pub(crate) const AVOIDED_FORCE: MeasureDefinition = MeasureDefinition::of_truth(
     "avoided_peak_force_n",
     "N",
     f64::INFINITY,
@@ -31,7 +21,7 @@ pub(crate) const AVOIDED_FORCE: MeasureDefinition = of_task(
     "How hard something was touched that must not be.",
 );
 
-pub(crate) const LIFT_HEIGHT: MeasureDefinition = of_task(
+pub(crate) const LIFT_HEIGHT: MeasureDefinition = MeasureDefinition::of_truth(
     "lift_height_m",
     "m",
     f64::INFINITY,
@@ -39,7 +29,7 @@ pub(crate) const LIFT_HEIGHT: MeasureDefinition = of_task(
     "How far the tissue was lifted.",
 );
 
-pub(crate) const HELD_SHARE: MeasureDefinition = of_task(
+pub(crate) const HELD_SHARE: MeasureDefinition = MeasureDefinition::of_truth(
     "held_share",
     "1",
     1.0,

@@ -214,10 +214,9 @@ fn a_tense_sheet_rests_exactly_and_a_slit_in_it_opens_as_inglis_says() {
     assert!((opening_m / expected_m - 1.0).abs() < 0.1, "{opening_m} m, {expected_m} m");
 }
 
-#[test]
-fn a_blade_pushes_first_and_then_cuts_with_the_work_of_separation() {
-    let toughness = 20.0;
-    let model = Model::paper(&[
+/// Returns a sheet of 75 mm like the scene `liver`, with keys that differ.
+pub(super) fn liver(more: &[&str]) -> Arc<Model> {
+    let sets = [
         "sheet.points=[31, 31]",
         "sheet.spacing_m=0.0025",
         "sheet.point_mass_kg=6.625e-5",
@@ -225,9 +224,14 @@ fn a_blade_pushes_first_and_then_cuts_with_the_work_of_separation() {
         "springs.shear_stiffness_n_per_m=20.25",
         "anchor_springs.stiffness_n_per_m=5.655",
         "damping.coefficient_n_s_per_m=0.01936",
-        "stepping.precision=f64",
-        "cutting.toughness_j_per_m2=20",
-    ]);
+    ];
+    Model::paper(&[&sets[..], more].concat())
+}
+
+#[test]
+fn a_blade_pushes_first_and_then_cuts_with_the_work_of_separation() {
+    let toughness = 20.0;
+    let model = liver(&["stepping.precision=f64", "cutting.toughness_j_per_m2=20"]);
     let mut tissue = at_rest(&model);
     let (mut pushed_n, mut cutting_n, mut largest_jump_n) = (0.0_f64, Vec::new(), 0.0_f64);
     let mut before_n = 0.0;
@@ -263,18 +267,8 @@ fn a_blade_pushes_first_and_then_cuts_with_the_work_of_separation() {
 
 #[test]
 fn a_blade_that_turns_as_it_cuts_does_not_look_like_energy_from_nowhere() {
-    let sets = [
-        "sheet.points=[31, 31]",
-        "sheet.spacing_m=0.0025",
-        "sheet.point_mass_kg=6.625e-5",
-        "springs.stiffness_n_per_m=40.5",
-        "springs.shear_stiffness_n_per_m=20.25",
-        "anchor_springs.stiffness_n_per_m=5.655",
-        "damping.coefficient_n_s_per_m=0.01936",
-    ];
     // Of a soft tissue, and of a liver, which a blade pushes far before it cuts.
-    let of = |toughness: &str| Model::paper(&[&sets[..], &[toughness]].concat());
-    let models = ["20", "187"].map(|toughness| of(&format!("cutting.toughness_j_per_m2={toughness}")));
+    let models = ["20", "187"].map(|toughness| liver(&[&format!("cutting.toughness_j_per_m2={toughness}")]));
     for (seed, model) in (0..8).zip(models.iter().cycle()) {
         let mut tissue = at_rest(model);
         let phase = f64::from(seed);

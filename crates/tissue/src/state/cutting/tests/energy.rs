@@ -1,8 +1,6 @@
 //! Tests of the energy of a cut: what a blade puts in is found again.
 #![allow(clippy::unwrap_used)]
 
-use std::sync::Arc;
-
 use glam::DVec3;
 
 use crate::Model;
@@ -16,21 +14,6 @@ const BLOCK: &str = "[solid]\norgan = { name = \"phantom\", edge_m = 0.008, seed
                      fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
                      [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.4\ndensity_kg_per_m3 = 980\n\
                      viscosity_pa_s = 0\ndamping_per_s = 60\n[cutting]\ntoughness_j_per_m2 = 20\n";
-
-fn sheet(more: &[&str]) -> Arc<Model> {
-    let sets = [
-        "sheet.points=[21, 25]",
-        "sheet.spacing_m=0.0025",
-        "sheet.point_mass_kg=6.625e-5",
-        "springs.stiffness_n_per_m=40.5",
-        "springs.shear_stiffness_n_per_m=20.25",
-        "anchor_springs.stiffness_n_per_m=5.655",
-        "damping.coefficient_n_s_per_m=0.01936",
-        "stepping.precision=f64",
-        "cutting.toughness_j_per_m2=20",
-    ];
-    Model::paper(&[&sets[..], more].concat())
-}
 
 /// A blade with an upright edge of 60 mm.
 fn blade() -> Tip {
@@ -53,7 +36,12 @@ fn the_work_of_a_blade_is_that_of_separation_and_what_the_tissue_keeps_or_loses_
     let block = Model::parse("block", BLOCK, &["stepping.precision=f64"]).unwrap();
     // Along y, from the rim inward: begin and way, m.
     for (kind, model, from_m, way_m) in [
-        ("sheet", sheet(&[]), DVec3::new(0.02625, 0.008, -0.005), 0.036),
+        (
+            "sheet",
+            super::liver(&["sheet.points=[21, 25]", "stepping.precision=f64", "cutting.toughness_j_per_m2=20"]),
+            DVec3::new(0.02625, 0.008, -0.005),
+            0.036,
+        ),
         ("solid", block, DVec3::new(0.002, -0.052, 0.02), 0.06),
     ] {
         let mut tissue = TissueState::<f64>::new(&model);
