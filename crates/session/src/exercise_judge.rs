@@ -26,8 +26,8 @@ pub struct ExerciseJudge {
     /// Number of severed springs, and the numbers of threads and clips, that were there at the beginning.
     severed_before: usize,
     ties_before: Vec<usize>,
-    /// Whether a tool has touched the tissue.
-    has_touched: bool,
+    /// Whether the trainee has done anything: touched the tissue, cut it, or marked a place.
+    has_acted: bool,
 }
 
 /// A criterion of the score and what it earned.
@@ -71,7 +71,7 @@ impl ExerciseJudge {
             newest: begin_step,
             severed_before: 0,
             ties_before: Vec::new(),
-            has_touched: false,
+            has_acted: false,
             exercise: exercise.clone(),
         })
     }
@@ -85,7 +85,9 @@ impl ExerciseJudge {
             self.severed_before = session.tissue().cuts().len();
             self.ties_before = session.tissue().ties().iter().map(|tie| tie.number).collect();
         }
-        self.has_touched |= rows.iter().any(|row| row.is_in_contact);
+        // A blade in a tissue without toughness feels nothing.
+        let has_cut = session.tissue().cuts().len() > self.severed_before;
+        self.has_acted |= has_cut || !session.marks().is_empty() || rows.iter().any(|row| row.is_in_contact);
         if step > self.newest {
             let up = -self.exercise.seen_along;
             let lifted_m = self.lifted.map_or(0.0, |point| session.tissue().point(point).displacement_m.dot(up));
@@ -116,7 +118,8 @@ impl ExerciseJudge {
         self.truth(session).figures(session.model().scene.stepping.rate_hz, &self.tasks)
     }
 
-    /// Returns the score by all figures, also those that need no truth; `None` without a criterion.
+    /// Returns the score by all figures, also those that need no truth; `None` without a criterion. A trainee who has done
+    /// nothing earns nothing, though nothing was done wrong.
     pub fn score(&self, figures: &[Figure]) -> Option<ExerciseScore> {
         let earned = |criterion: &Criterion| {
             let of_all = |figure: &&Figure| figure.definition.name == criterion.measure && figure.tool.is_none();
@@ -129,7 +132,7 @@ impl ExerciseJudge {
             EarnedCriterion {
                 criterion: criterion.clone(),
                 value,
-                part: value.map_or(0.0, |value| criterion.part(value)),
+                part: value.filter(|_| self.has_acted).map_or(0.0, |value| criterion.part(value)),
             }
         };
         let criteria: Vec<_> = self.exercise.criteria.iter().map(earned).collect();
