@@ -3,7 +3,7 @@
 //! - [`connect`]: connections, plain or TLS, with the caller's credentials, time limits, and errors in words.
 //! - [`fleet`]: finds the server of a fleet that has a session; [`followed`]: follows one session from server to
 //!   server.
-//! - [`held`]: tools that are held by calls, by which threads and clips are laid.
+//! - [`held_tools`]: tools that are held by calls, by which threads and clips are laid.
 //! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
 //! - [`datagrams`]: the datagrams of such a stream, where one lost packet does not delay the next.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
@@ -55,7 +55,7 @@ pub mod devices;
 mod exchange;
 pub mod fleet;
 pub mod followed;
-pub mod held;
+pub mod held_tools;
 pub mod os;
 pub mod snapshot;
 pub mod surface_view;
@@ -67,7 +67,7 @@ pub mod watch;
 pub use connect::{Channel, Credentials, Server, Token, describe};
 pub use device::{HapticDevice, Reading};
 pub use followed::Followed;
-pub use held::HeldTools;
+pub use held_tools::HeldTools;
 pub use touch::Touch;
 
 use palpate_refusal::printable::printable;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use palpate_client::Followed;
-use palpate_client::held::{acquire, send};
+use palpate_client::held_tools::{acquire, send};
 use palpate_proto::pb;
 use palpate_session::wire;
 use palpate_tissue::scene;

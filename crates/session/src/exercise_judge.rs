@@ -77,8 +77,7 @@ impl ExerciseJudge {
     }
 
     /// Takes the session at its present step, with the rows of its tools; the first time at its beginning, so that what was cut or tied
-    /// before does not count. Steps that were skipped at rest count as if nothing had
-    /// changed in them.
+    /// before does not count. Steps that were skipped at rest count as if nothing had changed in them.
     pub fn see(&mut self, session: &Session, rows: &[ToolRow]) {
         let step = session.step_count();
         if step == self.begin_step {
@@ -86,8 +85,10 @@ impl ExerciseJudge {
             self.ties_before = session.tissue().ties().iter().map(|tie| tie.number).collect();
         }
         // A blade in a tissue without toughness feels nothing.
-        let has_cut = session.tissue().cuts().len() > self.severed_before;
-        self.has_acted |= has_cut || !session.marks().is_empty() || rows.iter().any(|row| row.is_in_contact);
+        self.has_acted = self.has_acted
+            || rows.iter().any(|row| row.is_in_contact)
+            || !session.marks().is_empty()
+            || session.tissue().cuts().len() > self.severed_before;
         if step > self.newest {
             let up = -self.exercise.seen_along;
             let lifted_m = self.lifted.map_or(0.0, |point| session.tissue().point(point).displacement_m.dot(up));
