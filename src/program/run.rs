@@ -8,7 +8,7 @@ use palpate_session::Session;
 use palpate_session::run::{RunEvent, RunOptions, run_observed, write_event};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
-use palpate_tissue::scene::record::{self, StageTime, Summary};
+use palpate_tissue::scene::record::{self, StageTime, Summary, TopologyRecord};
 
 use super::indent::{self, IndentArguments};
 use super::scene::SceneArguments;
@@ -136,7 +136,11 @@ fn tell(arguments: &RunArguments, summary: &Summary) {
             ("peak reaction", format!("{:.6} N", summary.peak_reaction_n)),
             ("final hash", summary.final_hash.clone()),
         ];
-        text.extend(rows.map(|(name, value)| format!("{name:<28}{value}\n")));
+        let cuts = summary.topology.filter(|topology| topology.severed > 0).map(|topology| {
+            let TopologyRecord { severed, pieces, fracture_j, .. } = topology;
+            ("severed", format!("{severed}, pieces: {pieces}, fracture: {fracture_j:.3e} J"))
+        });
+        text.extend(rows.into_iter().chain(cuts).map(|(name, value)| format!("{name:<28}{value}\n")));
         let all_s: f64 = summary.stages.iter().map(|stage| stage.time_s).sum();
         for StageTime { stage, time_s } in summary.stages.iter().filter(|stage| stage.time_s > 0.0) {
             let (share, name) = (100.0 * time_s / all_s, format!("stage {stage}"));

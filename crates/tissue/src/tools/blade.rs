@@ -6,6 +6,7 @@
 //! the tissue ahead; beyond R the place slides with it, and the blade cuts (`state::cutting` severs what its edge then crosses). The work of
 //! R along that way is the fracture work; what the spring stores comes back. The coupling gives no energy.
 
+use glam::DVec3;
 use palpate_haptics::{ContactState, Coupling, TipShape};
 
 use crate::body::model::{Model, Plan, displacement_m};
@@ -18,6 +19,11 @@ const COUPLING: Coupling = Coupling::Spring { stiffness_n_per_m: 5000.0, damping
 
 /// The depth of an edge that lies along the surface is counted as if it rose by at least this part of its length.
 const MIN_SLOPE: f64 = 0.1;
+
+/// The search for the place that an edge pierces ends once it moves by less than this part of the disc's radius, or after so many
+/// moves.
+const NEAR: f64 = 0.1;
+const MAX_SEEKS: usize = 8;
 
 impl Tool {
     /// Returns how the tool is coupled to the tissue.
@@ -39,31 +45,29 @@ impl Tool {
         let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
         let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
         if self.contact_state == ContactState::Free && plan.is_first(fraction) {
-            self.seek(model, layout, state, place_m, plan.is_first(fraction));
+            self.seek_pierced(model, layout, state, [place_m, edge_m]);
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         self.normal = self.footprint.outward(&along);
         self.side = Some(1.0);
-        let below_m = (surface_m - place_m).dot(self.normal);
-        let depth_m = (below_m / edge.dot(self.normal).max(MIN_SLOPE)).min(length_m);
+        let depth_m = depth_m(surface_m - place_m, self.normal, edge).min(length_m);
         // Across the edge from the middle of the disc: where an edge leans on the surface, that is not where it leaves it.
         self.pierced_m = (surface_m - place_m).dot(edge);
         let most_n = model.scene.cutting.resistance_n(depth_m);
         self.resistance_n = most_n;
         let pierced_m = place_m + depth_m * edge;
         let is_beside = self.footprint.is_beside(pierced_m - surface_m, self.normal);
-        if below_m <= 0.0 || is_beside || most_n <= 0.0 || self.footprint.relative_inverse_mass() == 0.0 {
+        if depth_m <= 0.0 || is_beside || most_n <= 0.0 || self.footprint.relative_inverse_mass() == 0.0 {
             self.contact_state = ContactState::Free;
             return ContactForce::default();
         }
         if self.contact_state == ContactState::Free {
-            // Where the edge pierces the surface, not where its tip is.
-            self.footprint.seek(model, pierced_m, true, |point| displacement_m(model, layout, state, point));
+            // The middle of the disc is somewhere beside the place, where the surface is uneven. The spring begins unstretched.
+            self.offset_m = (place_m - surface_m).reject_from(edge);
             self.contact_state = ContactState::Sticking;
             return ContactForce::default();
         }
-        let gap_m = pierced_m - surface_m;
-        let across_m = gap_m - gap_m.dot(edge) * edge;
+        let across_m = (place_m - self.offset_m - surface_m).reject_from(edge);
         let thrust = self.thrust(model, plan, layout, state, across_m);
         let (force_n, wanted_n) = (thrust.force_n(), thrust.force_n().length());
         if wanted_n <= most_n || !has_room {
@@ -74,9 +78,44 @@ impl Tool {
         let ahead = force_n / wanted_n;
         let Coupling::Spring { stiffness_n_per_m, .. } = COUPLING else { return thrust };
         let lag_m = most_n / stiffness_n_per_m;
-        let slid_m = (across_m.dot(ahead) - lag_m).max(0.0).min(self.footprint.stride_m());
-        self.footprint.shift(model, slid_m * ahead, &along);
+        // Over the surface, to where the edge leaves it farther on.
+        let slope = edge.dot(self.normal).max(MIN_SLOPE);
+        let over = ahead - ahead.dot(self.normal) / slope * edge;
+        let most_m = self.footprint.stride_m() / over.length();
+        let slid_m = (across_m.dot(ahead) - lag_m).max(0.0).min(most_m);
+        self.footprint.shift(model, slid_m * over, &along);
         self.separated_j += most_n * slid_m;
         self.kicked_to(most_n * ahead)
     }
+
+    /// Moves the disc of a blade that touches nothing to where its edge pierces the surface: first below the heel, and from
+    /// there on to where the edge meets the plane that touches the surface there. `blade_m` are its tip and the way to its heel.
+    fn seek_pierced<T: Real>(
+        &mut self,
+        model: &Model,
+        layout: &Layout,
+        state: &State<T>,
+        [place_m, edge_m]: [DVec3; 2],
+    ) {
+        let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
+        let displacement_m = |point| displacement_m(model, layout, state, point);
+        let mut sought_m = place_m + edge_m;
+        for _ in 0..MAX_SEEKS {
+            self.footprint.seek(model, sought_m, true, displacement_m);
+            let (surface_m, along) = self.footprint.surface(displacement_m);
+            let depth_m = depth_m(surface_m - place_m, self.footprint.outward(&along), edge).clamp(0.0, length_m);
+            let pierced_m = place_m + depth_m * edge;
+            let is_found = pierced_m.distance(sought_m) < NEAR * self.footprint.radius_m();
+            if depth_m == 0.0 || is_found {
+                return;
+            }
+            sought_m = pierced_m;
+        }
+    }
+}
+
+/// Returns how deep the tip of a blade is beneath the plane that touches the surface at the way `surface_m` from it, along its edge; below
+/// 0 above the plane.
+fn depth_m(surface_m: DVec3, outward: DVec3, edge: DVec3) -> f64 {
+    surface_m.dot(outward) / edge.dot(outward).max(MIN_SLOPE)
 }

@@ -741,7 +741,7 @@ impl Tool {
                 // Along its edge a blade slides freely. Beyond its resistance the place of the tissue lags behind where the spring would
                 // hold it, because the displacement differs there: that stretches nothing.
                 let edge = self.from_edge_m.normalize_or_zero();
-                let stretched_m = (place_m - surface_m).reject_from(edge).length();
+                let stretched_m = (place_m - self.offset_m - surface_m).reject_from(edge).length();
                 let held_m = stretched_m.min(self.resistance_n / stiffness_n_per_m);
                 0.5 * stiffness_n_per_m * held_m * held_m
             }

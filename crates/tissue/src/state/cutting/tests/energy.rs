@@ -68,3 +68,26 @@ fn the_work_of_a_blade_is_that_of_separation_and_what_the_tissue_keeps_or_loses_
         assert!((found_j / work_j - 1.0).abs() < 0.01, "{kind}: {found_j} J of {work_j} J");
     }
 }
+
+/// The shipped organ, 180 mm wide.
+const ORGAN: &str = include_str!("../../../../../../scenes/liver-organ.toml");
+
+#[test]
+fn a_blade_that_enters_an_organ_from_any_side_does_not_look_like_energy_from_nowhere() {
+    let sets = ["mesh.organ={ name = \"liver\", edge_m = 0.004, seed = 1 }", "cutting.toughness_j_per_m2=187"];
+    let model = Model::parse("liver-organ", ORGAN, &sets).unwrap();
+    let extent = model.shape().extent();
+    let (middle_m, across_m) = (extent.middle_m(), extent.size_m());
+    for seed in 0..8 {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let mut within = |part: f64| part * across_m * DVec3::from_array([(); 3].map(|()| random.f64() - 0.5));
+        let (begin_m, through_m) = (middle_m + within(1.5), middle_m + within(0.7));
+        let edge = within(1.0).normalize();
+        let mut tissue = TissueState::<f32>::new(&model);
+        let tip = Tip { edge_m: 0.06 * edge, ..blade() };
+        for step in 0..1500_u32 {
+            tissue.pose(0, begin_m.lerp(through_m, f64::from(step) / 750.0), tip);
+            tissue.step().unwrap_or_else(|found| panic!("seed {seed}, {} cut: {found:?}", tissue.cuts().len()));
+        }
+    }
+}
