@@ -60,6 +60,8 @@ export class Hand {
   private sinksFromMs: number | undefined;
   private isLeft = false;
   private bladeLead: Lead | undefined;
+  /** How far the tissue is shifted sideways where the blade goes, m. */
+  private shiftedM: Vec3 = [0, 0, 0];
 
   /** The hand has the tool `firstTool` of the session, and a grasper those after it, too. */
   constructor(
@@ -183,6 +185,7 @@ export class Hand {
     this.isLeft = false;
     this.place = place;
     this.onSurfaceM = onSurfaceM;
+    this.shiftedM = this.shiftedAt(place);
     this.leanM = [0, 0, 0];
     this.sinksFromMs = undefined;
     if (this.mode === "grasper") this.grasper.begin(place, view);
@@ -196,6 +199,7 @@ export class Hand {
     // The earlier tilt fades over the length that tilts a push fully.
     const kept = Math.exp(-Math.hypot(...way) / this.reach.depthM);
     this.place = place;
+    this.shiftedM = this.shiftedAt(place);
     this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], kept * this.leanM[2] + way[2]]);
   }
 
@@ -245,13 +249,24 @@ export class Hand {
     return this.sinksFromMs === undefined ? 0 : Math.min(1, (now - this.sinksFromMs) / SINK_MS);
   }
 
-  /** Returns the position of the tip at a place. The edge of a blade runs from there straight out of the tissue. */
+  /** Returns how far the tissue is shifted sideways at a place, m. */
+  private shiftedAt(place: Place): Vec3 {
+    const { x, y, z } = this.surface().displacementAt(place);
+    const [nx, ny, nz] = place.outward;
+    return plus([x, y, z], place.outward, -(x * nx + y * ny + z * nz));
+  }
+
+  /**
+   * Returns the position of the tip at a place. The edge of a blade runs from there straight out of the tissue. A blade that pushes tissue
+   * ahead of it goes to where the place is seen: at its place at rest it would stay behind the pointer.
+   */
   private tip({ restM, outward }: Place, now: number): Lead {
     const { lengthM, depthM, tipShape } = this.reach;
     const positionM = plus(restM, outward, this.outM(now));
     if (this.mode !== "blade") return { positionM, radiusM: lengthM, shape: tipShape };
     const edgeM = plus([0, 0, 0], outward, EDGE * depthM);
-    return (this.bladeLead = { positionM, radiusM: BLADE * lengthM, shape: TipShape.BLADE, edgeM });
+    const bladeM = plus(positionM, this.shiftedM);
+    return (this.bladeLead = { positionM: bladeM, radiusM: BLADE * lengthM, shape: TipShape.BLADE, edgeM });
   }
 
   /** Returns the height of a tip above its place at rest: on its way from beside the tissue, or at its depth. */
