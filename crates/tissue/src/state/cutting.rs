@@ -116,7 +116,12 @@ impl<T: Real> TissueState<T> {
     /// Severs the springs that blades cross in this step, those that burn through, and those that tear.
     pub(super) fn cut(&mut self) {
         for tool in &mut self.contacts.tools {
-            self.tables.severed.add_fracture(std::mem::take(&mut tool.separated_j));
+            let separated_j = std::mem::take(&mut tool.separated_j);
+            self.tables.severed.add_fracture(separated_j);
+            if separated_j > 0.0 {
+                // When tough tissue gives way, a twin that steps otherwise does so at another moment.
+                self.audit_window.give_up();
+            }
         }
         let burnt = self.burnt();
         let blades = self.contacts.tools.iter().filter(|tool| tool.tip.shape == TipShape::Blade);
