@@ -1,6 +1,7 @@
 &[
 ("AcknowledgeFramesRequest", |bytes| <AcknowledgeFramesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("AcquireToolRequest", |bytes| <AcquireToolRequest as ::prost::Message>::decode(bytes).is_ok()),
+("AdviseTraineeRequest", |bytes| <AdviseTraineeRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("CreateHereRequest", |bytes| <CreateHereRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("CreateSessionRequest", |bytes| <CreateSessionRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("CutCallerRequest", |bytes| <CutCallerRequest as ::prost::Message>::decode(bytes).is_ok()),
@@ -8,6 +9,7 @@
 ("DeleteJournalRequest", |bytes| <DeleteJournalRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("DeleteSessionRequest", |bytes| <DeleteSessionRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("DrainNodeRequest", |bytes| <DrainNodeRequest as ::prost::Message>::decode(bytes).is_ok()),
+("FinishExerciseRequest", |bytes| <FinishExerciseRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("FreeToolRequest", |bytes| <FreeToolRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetJournalRequest", |bytes| <GetJournalRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetMeshRequest", |bytes| <GetMeshRequest as ::prost::Message>::decode(bytes).is_ok()),
@@ -18,6 +20,7 @@
 ("GetTopologyRequest", |bytes| <GetTopologyRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetWoundRequest", |bytes| <GetWoundRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListCallersRequest", |bytes| <ListCallersRequest as ::prost::Message>::decode(bytes).is_ok()),
+("ListExercisesRequest", |bytes| <ListExercisesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListFleetSessionsRequest", |bytes| <ListFleetSessionsRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListJournalsRequest", |bytes| <ListJournalsRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListNodesRequest", |bytes| <ListNodesRequest as ::prost::Message>::decode(bytes).is_ok()),
@@ -41,6 +44,7 @@
 ("UpdateTissueRequest", |bytes| <UpdateTissueRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("UploadJournalRequest", |bytes| <UploadJournalRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("UploadMeshRequest", |bytes| <UploadMeshRequest as ::prost::Message>::decode(bytes).is_ok()),
+("WatchExerciseRequest", |bytes| <WatchExerciseRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("WatchFramesRequest", |bytes| <WatchFramesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("WatchSamplesRequest", |bytes| <WatchSamplesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ]

@@ -36,7 +36,7 @@ pub struct Input {
     #[prost(uint64, tag = "1")]
     pub step: u64,
     /// The kind of input.
-    #[prost(oneof = "input::What", tags = "2, 3, 4, 5, 6, 7, 8")]
+    #[prost(oneof = "input::What", tags = "2, 3, 4, 5, 6, 7, 8, 9")]
     pub what: ::core::option::Option<input::What>,
 }
 /// Nested message and enum types in `Input`.
@@ -58,6 +58,8 @@ pub mod input {
         Revive(super::Revive),
         #[prost(message, tag = "8")]
         Hold(super::Hold),
+        #[prost(message, tag = "9")]
+        ExerciseResult(super::ExerciseResult),
     }
 }
 impl ::prost::Name for Input {
@@ -438,6 +440,49 @@ impl ::prost::Name for Hold {
         "/palpate.journal.v1.Hold".into()
     }
 }
+/// The result of the session's exercise: it has ended before this input. It changes nothing.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ExerciseResult {
+    /// Number of steps done when it ended.
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    #[prost(message, repeated, tag = "2")]
+    pub figures: ::prost::alloc::vec::Vec<Figure>,
+    /// Absent for an exercise without criteria.
+    #[prost(double, optional, tag = "3")]
+    pub score_percent: ::core::option::Option<f64>,
+}
+impl ::prost::Name for ExerciseResult {
+    const NAME: &'static str = "ExerciseResult";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.ExerciseResult".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.ExerciseResult".into()
+    }
+}
+/// The value of a measure.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Figure {
+    #[prost(string, tag = "1")]
+    pub measure: ::prost::alloc::string::String,
+    #[prost(double, tag = "2")]
+    pub value: f64,
+    /// Absent: of all tools together.
+    #[prost(uint32, optional, tag = "3")]
+    pub tool: ::core::option::Option<u32>,
+}
+impl ::prost::Name for Figure {
+    const NAME: &'static str = "Figure";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.Figure".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.Figure".into()
+    }
+}
 /// Topic /hashes.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Hash {
@@ -729,6 +774,9 @@ pub struct Header {
     /// The revision of etcd at which the server became the owner of the session; 0 without a fleet.
     #[prost(uint64, tag = "15")]
     pub ownership_revision: u64,
+    /// The exercise that the session is made for, if it is for one.
+    #[prost(message, optional, tag = "16")]
+    pub exercise: ::core::option::Option<RecordedExercise>,
 }
 impl ::prost::Name for Header {
     const NAME: &'static str = "Header";
@@ -738,6 +786,29 @@ impl ::prost::Name for Header {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.Header".into()
+    }
+}
+/// An exercise and its hidden truth.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct RecordedExercise {
+    /// Its text, TOML.
+    #[prost(string, tag = "1")]
+    pub text: ::prost::alloc::string::String,
+    /// The seed of the hidden truth. The scene of the header has that truth in it.
+    #[prost(uint64, tag = "2")]
+    pub seed: u64,
+    /// The id that opens the session for a trainee.
+    #[prost(string, tag = "3")]
+    pub trainee_id: ::prost::alloc::string::String,
+}
+impl ::prost::Name for RecordedExercise {
+    const NAME: &'static str = "RecordedExercise";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.RecordedExercise".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.RecordedExercise".into()
     }
 }
 /// A triangle mesh in full precision.

@@ -167,6 +167,1027 @@ impl ::prost::Name for Extent {
         "/palpate.v1.Extent".into()
     }
 }
+/// Which exercise a session is made for, with which hidden truth.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ChosenExercise {
+    /// The hidden truth is drawn from it. Absent: from one that the server draws, below 2^53. Who knows the exercise and the seed knows
+    /// the truth, so a small number can be guessed.
+    #[prost(uint64, optional, tag = "3")]
+    pub seed: ::core::option::Option<u64>,
+    /// A scene of the server. Empty: the first for which the exercise is made.
+    #[prost(string, tag = "4")]
+    pub scene_name: ::prost::alloc::string::String,
+    #[prost(oneof = "chosen_exercise::Source", tags = "1, 2")]
+    pub source: ::core::option::Option<chosen_exercise::Source>,
+}
+/// Nested message and enum types in `ChosenExercise`.
+pub mod chosen_exercise {
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Source {
+        /// The name of an exercise of the server.
+        #[prost(string, tag = "1")]
+        Name(::prost::alloc::string::String),
+        /// The text of one (TOML). It may not change the scene (`set`).
+        #[prost(string, tag = "2")]
+        Text(::prost::alloc::string::String),
+    }
+}
+impl ::prost::Name for ChosenExercise {
+    const NAME: &'static str = "ChosenExercise";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ChosenExercise".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ChosenExercise".into()
+    }
+}
+/// What everybody may know of an exercise.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Exercise {
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    #[prost(string, tag = "2")]
+    pub title: ::prost::alloc::string::String,
+    #[prost(string, tag = "3")]
+    pub instructions: ::prost::alloc::string::String,
+    /// The scenes for which it is made.
+    #[prost(string, repeated, tag = "4")]
+    pub scene_names: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The time that the trainee has, simulated; absent: no limit.
+    #[prost(double, optional, tag = "5")]
+    pub time_limit_s: ::core::option::Option<f64>,
+    /// The force that no tool may exceed.
+    #[prost(double, optional, tag = "6")]
+    pub force_limit_n: ::core::option::Option<f64>,
+    /// The pressure from which on a part of the surface counts as felt.
+    #[prost(double, optional, tag = "7")]
+    pub coverage_pa: ::core::option::Option<f64>,
+    /// Whether something is hidden.
+    #[prost(bool, tag = "8")]
+    pub hides_truth: bool,
+    /// The direction in which the trainee looks.
+    #[prost(message, optional, tag = "9")]
+    pub seen_along: ::core::option::Option<Vector3>,
+    /// The lines to be cut.
+    #[prost(message, repeated, tag = "10")]
+    pub lines: ::prost::alloc::vec::Vec<ExerciseLine>,
+    /// The regions that no tool may touch.
+    #[prost(message, repeated, tag = "11")]
+    pub avoided: ::prost::alloc::vec::Vec<ExerciseBall>,
+    /// The place that is to be lifted, at rest.
+    #[prost(message, optional, tag = "12")]
+    pub lifted_m: ::core::option::Option<Vector3>,
+    /// The measures that a trainee is sent while the exercise goes on.
+    #[prost(string, repeated, tag = "13")]
+    pub live_measures: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Whether a trainee is sent the result, with what was hidden.
+    #[prost(bool, tag = "14")]
+    pub tells_result: bool,
+}
+impl ::prost::Name for Exercise {
+    const NAME: &'static str = "Exercise";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Exercise".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Exercise".into()
+    }
+}
+/// A line on the surface at rest.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ExerciseLine {
+    #[prost(message, repeated, tag = "1")]
+    pub points_m: ::prost::alloc::vec::Vec<Vector3>,
+    #[prost(double, tag = "2")]
+    pub within_m: f64,
+}
+impl ::prost::Name for ExerciseLine {
+    const NAME: &'static str = "ExerciseLine";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ExerciseLine".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ExerciseLine".into()
+    }
+}
+/// A ball at rest.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct ExerciseBall {
+    #[prost(message, optional, tag = "1")]
+    pub centre_m: ::core::option::Option<Vector3>,
+    #[prost(double, tag = "2")]
+    pub radius_m: f64,
+}
+impl ::prost::Name for ExerciseBall {
+    const NAME: &'static str = "ExerciseBall";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ExerciseBall".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ExerciseBall".into()
+    }
+}
+/// The exercise that a session is made for.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SessionExercise {
+    #[prost(message, optional, tag = "1")]
+    pub exercise: ::core::option::Option<Exercise>,
+    #[prost(enumeration = "ExerciseRole", tag = "2")]
+    pub role: i32,
+    /// For trainers: the id that opens the session for a trainee. Random, so that nobody can guess it.
+    #[prost(string, tag = "3")]
+    pub trainee_id: ::prost::alloc::string::String,
+    /// For trainers: the seed of the hidden truth.
+    #[prost(uint64, optional, tag = "4")]
+    pub seed: ::core::option::Option<u64>,
+    /// Number of steps done when it began.
+    #[prost(uint64, tag = "5")]
+    pub begin_step: u64,
+    /// Whether it has ended.
+    #[prost(bool, tag = "6")]
+    pub finished: bool,
+}
+impl ::prost::Name for SessionExercise {
+    const NAME: &'static str = "SessionExercise";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.SessionExercise".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.SessionExercise".into()
+    }
+}
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ListExercisesRequest {}
+impl ::prost::Name for ListExercisesRequest {
+    const NAME: &'static str = "ListExercisesRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ListExercisesRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ListExercisesRequest".into()
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ListExercisesResponse {
+    /// By name, in alphabetical order.
+    #[prost(message, repeated, tag = "1")]
+    pub exercises: ::prost::alloc::vec::Vec<Exercise>,
+}
+impl ::prost::Name for ListExercisesResponse {
+    const NAME: &'static str = "ListExercisesResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ListExercisesResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ListExercisesResponse".into()
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct WatchExerciseRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+}
+impl ::prost::Name for WatchExerciseRequest {
+    const NAME: &'static str = "WatchExerciseRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.WatchExerciseRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.WatchExerciseRequest".into()
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct WatchExerciseResponse {
+    /// Number of steps done when the figures were taken.
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    /// Simulated time since the exercise began.
+    #[prost(double, tag = "2")]
+    pub time_s: f64,
+    /// The figures so far: all for a trainer, `Exercise.live_measures` for a trainee. Figures without a value are left out.
+    #[prost(message, repeated, tag = "3")]
+    pub figures: ::prost::alloc::vec::Vec<Figure>,
+    /// For trainers: the score if it ended now. Absent for an exercise without criteria.
+    #[prost(double, optional, tag = "4")]
+    pub score_percent: ::core::option::Option<f64>,
+    /// New advice since the message before; of more than 64 the first.
+    #[prost(message, repeated, tag = "5")]
+    pub advice: ::prost::alloc::vec::Vec<Advice>,
+    /// Set once it has ended: this is the last message.
+    #[prost(message, optional, tag = "6")]
+    pub result: ::core::option::Option<ExerciseResult>,
+}
+impl ::prost::Name for WatchExerciseResponse {
+    const NAME: &'static str = "WatchExerciseResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.WatchExerciseResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.WatchExerciseResponse".into()
+    }
+}
+/// The value of a measure.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Figure {
+    /// Its name, with the unit at the end if it has one (docs/exercises.md).
+    #[prost(string, tag = "1")]
+    pub measure: ::prost::alloc::string::String,
+    #[prost(double, tag = "2")]
+    pub value: f64,
+    #[prost(string, tag = "3")]
+    pub unit: ::prost::alloc::string::String,
+    /// Absent: of all tools together.
+    #[prost(uint32, optional, tag = "4")]
+    pub tool: ::core::option::Option<u32>,
+}
+impl ::prost::Name for Figure {
+    const NAME: &'static str = "Figure";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Figure".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Figure".into()
+    }
+}
+/// The result of an exercise.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ExerciseResult {
+    /// Number of steps done when it ended: what was done later does not count.
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    /// Simulated time that it took.
+    #[prost(double, tag = "2")]
+    pub time_s: f64,
+    /// Whether the rest is set: for a trainer always, for a trainee if the exercise says so.
+    #[prost(bool, tag = "3")]
+    pub is_told: bool,
+    #[prost(message, repeated, tag = "4")]
+    pub figures: ::prost::alloc::vec::Vec<Figure>,
+    /// Absent for an exercise without criteria.
+    #[prost(double, optional, tag = "5")]
+    pub score_percent: ::core::option::Option<f64>,
+    #[prost(message, repeated, tag = "6")]
+    pub criteria: ::prost::alloc::vec::Vec<EarnedCriterion>,
+    /// What was hidden.
+    #[prost(message, repeated, tag = "7")]
+    pub lumps: ::prost::alloc::vec::Vec<HiddenLump>,
+    /// What was marked.
+    #[prost(message, repeated, tag = "8")]
+    pub answers: ::prost::alloc::vec::Vec<GivenAnswer>,
+}
+impl ::prost::Name for ExerciseResult {
+    const NAME: &'static str = "ExerciseResult";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ExerciseResult".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ExerciseResult".into()
+    }
+}
+/// What a criterion of the score has earned.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct EarnedCriterion {
+    #[prost(string, tag = "1")]
+    pub measure: ::prost::alloc::string::String,
+    #[prost(double, tag = "2")]
+    pub weight: f64,
+    /// The values that earn nothing, and all.
+    #[prost(double, tag = "3")]
+    pub poor: f64,
+    #[prost(double, tag = "4")]
+    pub good: f64,
+    /// Absent: the measure has no value, which earns nothing.
+    #[prost(double, optional, tag = "5")]
+    pub value: ::core::option::Option<f64>,
+    /// The earned part of the weight, 0 to 1.
+    #[prost(double, tag = "6")]
+    pub earned: f64,
+}
+impl ::prost::Name for EarnedCriterion {
+    const NAME: &'static str = "EarnedCriterion";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.EarnedCriterion".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.EarnedCriterion".into()
+    }
+}
+/// A lump that was hidden.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct HiddenLump {
+    #[prost(message, optional, tag = "1")]
+    pub centre_m: ::core::option::Option<Vector3>,
+    #[prost(double, tag = "2")]
+    pub radius_m: f64,
+    /// Stiffness inside over that outside.
+    #[prost(double, tag = "3")]
+    pub stiffness_factor: f64,
+}
+impl ::prost::Name for HiddenLump {
+    const NAME: &'static str = "HiddenLump";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.HiddenLump".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.HiddenLump".into()
+    }
+}
+/// A place that a trainee marked (Command.mark).
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct GivenAnswer {
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    #[prost(uint32, tag = "2")]
+    pub tool: u32,
+    #[prost(message, optional, tag = "3")]
+    pub place_m: ::core::option::Option<Vector3>,
+    #[prost(double, optional, tag = "4")]
+    pub diameter_m: ::core::option::Option<f64>,
+}
+impl ::prost::Name for GivenAnswer {
+    const NAME: &'static str = "GivenAnswer";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GivenAnswer".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GivenAnswer".into()
+    }
+}
+/// What a trainer tells the trainee.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Advice {
+    /// From 1 in a session.
+    #[prost(uint32, tag = "1")]
+    pub number: u32,
+    /// At most 500 bytes, without control characters; may be empty with a marker.
+    #[prost(string, tag = "2")]
+    pub text: ::prost::alloc::string::String,
+    /// A marker at this place of the surface at rest, at most a tenth of the tissue's longest side away from it. Absent: a hint.
+    #[prost(message, optional, tag = "3")]
+    pub place_m: ::core::option::Option<Vector3>,
+}
+impl ::prost::Name for Advice {
+    const NAME: &'static str = "Advice";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.Advice".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.Advice".into()
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FinishExerciseRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+}
+impl ::prost::Name for FinishExerciseRequest {
+    const NAME: &'static str = "FinishExerciseRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.FinishExerciseRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.FinishExerciseRequest".into()
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FinishExerciseResponse {
+    #[prost(message, optional, tag = "1")]
+    pub result: ::core::option::Option<ExerciseResult>,
+}
+impl ::prost::Name for FinishExerciseResponse {
+    const NAME: &'static str = "FinishExerciseResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.FinishExerciseResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.FinishExerciseResponse".into()
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct AdviseTraineeRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    #[prost(string, tag = "2")]
+    pub text: ::prost::alloc::string::String,
+    #[prost(message, optional, tag = "3")]
+    pub place_m: ::core::option::Option<Vector3>,
+}
+impl ::prost::Name for AdviseTraineeRequest {
+    const NAME: &'static str = "AdviseTraineeRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.AdviseTraineeRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.AdviseTraineeRequest".into()
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct AdviseTraineeResponse {
+    /// As sent.
+    #[prost(message, optional, tag = "1")]
+    pub advice: ::core::option::Option<Advice>,
+}
+impl ::prost::Name for AdviseTraineeResponse {
+    const NAME: &'static str = "AdviseTraineeResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.AdviseTraineeResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.AdviseTraineeResponse".into()
+    }
+}
+/// Who a caller is in a session that is made for an exercise.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum ExerciseRole {
+    Unspecified = 0,
+    /// It has called with the session's own id.
+    Trainer = 1,
+    /// It has called with the trainee's id.
+    Trainee = 2,
+}
+impl ExerciseRole {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "EXERCISE_ROLE_UNSPECIFIED",
+            Self::Trainer => "EXERCISE_ROLE_TRAINER",
+            Self::Trainee => "EXERCISE_ROLE_TRAINEE",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "EXERCISE_ROLE_UNSPECIFIED" => Some(Self::Unspecified),
+            "EXERCISE_ROLE_TRAINER" => Some(Self::Trainer),
+            "EXERCISE_ROLE_TRAINEE" => Some(Self::Trainee),
+            _ => None,
+        }
+    }
+}
+/// Generated client implementations.
+#[cfg(feature = "client")]
+pub mod exercise_service_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    /// Lists exercises, and shows and ends one that a session is made for.
+    #[derive(Debug, Clone)]
+    pub struct ExerciseServiceClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl<T> ExerciseServiceClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> ExerciseServiceClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            ExerciseServiceClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        /// Lists the exercises for which a session can be created by name.
+        pub async fn list_exercises(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ListExercisesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ListExercisesResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ExerciseService/ListExercises",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ExerciseService", "ListExercises"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Streams the measures of a session's exercise so far, 10 times per second of simulated time, also while the tissue rests; what the
+        /// trainer advises; and the result. A slow reader gets the newest. The stream ends after the result.
+        pub async fn watch_exercise(
+            &mut self,
+            request: impl tonic::IntoRequest<super::WatchExerciseRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::WatchExerciseResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ExerciseService/WatchExercise",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ExerciseService", "WatchExercise"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+        /// Ends a session's exercise now, unless it has ended, and returns its result. The session goes on.
+        pub async fn finish_exercise(
+            &mut self,
+            request: impl tonic::IntoRequest<super::FinishExerciseRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::FinishExerciseResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ExerciseService/FinishExercise",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ExerciseService", "FinishExercise"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Sends the trainee a hint or a marker. For trainers; at most 64 in a session (TOO_MANY).
+        pub async fn advise_trainee(
+            &mut self,
+            request: impl tonic::IntoRequest<super::AdviseTraineeRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::AdviseTraineeResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ExerciseService/AdviseTrainee",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ExerciseService", "AdviseTrainee"));
+            self.inner.unary(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+#[cfg(feature = "server")]
+pub mod exercise_service_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with ExerciseServiceServer.
+    #[async_trait]
+    pub trait ExerciseService: std::marker::Send + std::marker::Sync + 'static {
+        /// Lists the exercises for which a session can be created by name.
+        async fn list_exercises(
+            &self,
+            request: tonic::Request<super::ListExercisesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ListExercisesResponse>,
+            tonic::Status,
+        >;
+        /// Server streaming response type for the WatchExercise method.
+        type WatchExerciseStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::WatchExerciseResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Streams the measures of a session's exercise so far, 10 times per second of simulated time, also while the tissue rests; what the
+        /// trainer advises; and the result. A slow reader gets the newest. The stream ends after the result.
+        async fn watch_exercise(
+            &self,
+            request: tonic::Request<super::WatchExerciseRequest>,
+        ) -> std::result::Result<
+            tonic::Response<Self::WatchExerciseStream>,
+            tonic::Status,
+        >;
+        /// Ends a session's exercise now, unless it has ended, and returns its result. The session goes on.
+        async fn finish_exercise(
+            &self,
+            request: tonic::Request<super::FinishExerciseRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::FinishExerciseResponse>,
+            tonic::Status,
+        >;
+        /// Sends the trainee a hint or a marker. For trainers; at most 64 in a session (TOO_MANY).
+        async fn advise_trainee(
+            &self,
+            request: tonic::Request<super::AdviseTraineeRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::AdviseTraineeResponse>,
+            tonic::Status,
+        >;
+    }
+    /// Lists exercises, and shows and ends one that a session is made for.
+    #[derive(Debug)]
+    pub struct ExerciseServiceServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> ExerciseServiceServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for ExerciseServiceServer<T>
+    where
+        T: ExerciseService,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/palpate.v1.ExerciseService/ListExercises" => {
+                    #[allow(non_camel_case_types)]
+                    struct ListExercisesSvc<T: ExerciseService>(pub Arc<T>);
+                    impl<
+                        T: ExerciseService,
+                    > tonic::server::UnaryService<super::ListExercisesRequest>
+                    for ListExercisesSvc<T> {
+                        type Response = super::ListExercisesResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ListExercisesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ExerciseService>::list_exercises(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ListExercisesSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ExerciseService/WatchExercise" => {
+                    #[allow(non_camel_case_types)]
+                    struct WatchExerciseSvc<T: ExerciseService>(pub Arc<T>);
+                    impl<
+                        T: ExerciseService,
+                    > tonic::server::ServerStreamingService<super::WatchExerciseRequest>
+                    for WatchExerciseSvc<T> {
+                        type Response = super::WatchExerciseResponse;
+                        type ResponseStream = T::WatchExerciseStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::WatchExerciseRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ExerciseService>::watch_exercise(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = WatchExerciseSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ExerciseService/FinishExercise" => {
+                    #[allow(non_camel_case_types)]
+                    struct FinishExerciseSvc<T: ExerciseService>(pub Arc<T>);
+                    impl<
+                        T: ExerciseService,
+                    > tonic::server::UnaryService<super::FinishExerciseRequest>
+                    for FinishExerciseSvc<T> {
+                        type Response = super::FinishExerciseResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::FinishExerciseRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ExerciseService>::finish_exercise(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = FinishExerciseSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ExerciseService/AdviseTrainee" => {
+                    #[allow(non_camel_case_types)]
+                    struct AdviseTraineeSvc<T: ExerciseService>(pub Arc<T>);
+                    impl<
+                        T: ExerciseService,
+                    > tonic::server::UnaryService<super::AdviseTraineeRequest>
+                    for AdviseTraineeSvc<T> {
+                        type Response = super::AdviseTraineeResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::AdviseTraineeRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ExerciseService>::advise_trainee(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = AdviseTraineeSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for ExerciseServiceServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "palpate.v1.ExerciseService";
+    impl<T> tonic::server::NamedService for ExerciseServiceServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}
 /// One command to one tool.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Command {
@@ -3686,7 +4707,7 @@ pub struct CreateSessionRequest {
     #[prost(double, optional, tag = "4")]
     pub idle_timeout_s: ::core::option::Option<f64>,
     /// The source of the session.
-    #[prost(oneof = "create_session_request::Source", tags = "1, 2, 5")]
+    #[prost(oneof = "create_session_request::Source", tags = "1, 2, 5, 6")]
     pub source: ::core::option::Option<create_session_request::Source>,
 }
 /// Nested message and enum types in `CreateSessionRequest`.
@@ -3703,6 +4724,9 @@ pub mod create_session_request {
         /// A moment of a recorded session, whose journal the server keeps or the client has uploaded.
         #[prost(message, tag = "5")]
         Journal(super::JournalMoment),
+        /// An exercise: its scene, with what it hides. Not on a server of a fleet.
+        #[prost(message, tag = "6")]
+        Exercise(super::ChosenExercise),
     }
 }
 impl ::prost::Name for CreateSessionRequest {
@@ -3893,6 +4917,10 @@ pub struct Session {
     /// Energy that has gone into separation, J: the work of blades at their edges, and what severed springs had stored.
     #[prost(double, tag = "41")]
     pub fracture_j: f64,
+    /// Set if the session is made for an exercise. With the trainee's id, the session has the id that was sent; its scene and what
+    /// follows from it are those of the tissue without what is hidden.
+    #[prost(message, optional, tag = "42")]
+    pub exercise: ::core::option::Option<SessionExercise>,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";

@@ -10,7 +10,7 @@ use palpate_tissue::Model;
 use palpate_tissue::scene::collection::find_script;
 
 use super::scene::{SceneArguments, compile_with};
-use super::score::exercise::{ChosenExercise, ExerciseOptions};
+use super::score::exercise::{self, ExerciseOptions};
 use super::{Failure, clock_s, say};
 
 #[derive(clap::Args)]
@@ -60,7 +60,7 @@ fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
 /// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
-    let (model, limits) = ChosenExercise::compile(chosen.as_ref(), &arguments.scene)?;
+    let (model, limits) = exercise::compile(chosen.as_ref(), &arguments.scene)?;
     if let Some(chosen) = &chosen {
         ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
     }

@@ -12,7 +12,7 @@ use palpate_tissue::scene::record::{self, StageTime, Summary, TopologyRecord};
 
 use super::indent::{self, IndentArguments};
 use super::scene::SceneArguments;
-use super::score::exercise::{ChosenExercise, ExerciseOptions};
+use super::score::exercise::{ExerciseOptions, compile, usual_thresholds};
 use super::score::{ScoreOptions, ScoreRecorder, ScoreSource};
 use super::{Failure, clock_s, say, with_progress};
 
@@ -60,8 +60,8 @@ pub(crate) struct RunArguments {
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
-    let (model, limits) = ChosenExercise::compile(chosen.as_ref(), &arguments.scene)?;
-    let options = arguments.score_options.checked(ChosenExercise::thresholds(chosen.as_ref()))?;
+    let (model, limits) = compile(chosen.as_ref(), &arguments.scene)?;
+    let options = arguments.score_options.checked(usual_thresholds(chosen.as_ref()))?;
     if let (None, Some(option)) = (&arguments.score, arguments.score_options.given()) {
         return Err(Failure::Refused(format!("{option}: goes with --score FILE alone")));
     }
@@ -85,7 +85,7 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let mut recorder = match &arguments.score {
         Some(_) => {
             let continuous = (!arguments.held).then_some(&script);
-            Some(ScoreRecorder::new(&model, 0, options, continuous, chosen.as_ref())?)
+            Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), None))?)
         }
         None => None,
     };

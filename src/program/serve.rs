@@ -62,6 +62,9 @@ pub(crate) struct ServeArguments {
     /// Folder of the scripts that clients can read by name [default: scripts]
     #[arg(long, value_name = "DIR")]
     scripts: Option<PathBuf>,
+    /// Folder of the exercises that clients can create sessions for by name [default: exercises]
+    #[arg(long, value_name = "DIR")]
+    exercises: Option<PathBuf>,
     /// Folder of the page that `/` serves, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
     #[arg(long, value_name = "DIR")]
     viewer: Option<PathBuf>,
@@ -191,6 +194,7 @@ pub(crate) fn serve_in(arguments: &ServeArguments, host: ServerHost) -> Result<(
     for (option, folder, key) in [
         ("--scenes", &arguments.scenes, &mut config.scenes),
         ("--scripts", &arguments.scripts, &mut config.scripts),
+        ("--exercises", &arguments.exercises, &mut config.exercises),
         ("--viewer", &arguments.viewer, &mut config.viewer),
     ] {
         let Some(folder) = folder else { continue };

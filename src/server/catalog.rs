@@ -1,4 +1,4 @@
-//! Scenes and scripts by name: the files of the server's folders, and the built-in ones.
+//! Scenes, scripts and exercises by name: the files of the server's folders, and the built-in ones.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -7,29 +7,32 @@ use palpate_refusal::{Refusal, Result};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::scene::collection::Collection;
+use palpate_tissue::scene::exercise::Exercise;
 use palpate_tissue::scene::kind::TextKind;
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::scene::script_reader::fits;
 use palpate_tissue::scene::{BUILT_IN, Scene};
 
-/// The scenes and scripts that clients can ask for by name: the files `NAME.toml` of two folders, and the built-in
+/// The scenes, scripts and exercises that clients can ask for by name: the files `NAME.toml` of three folders, and the built-in
 /// ones. A file replaces the built-in text of its name. Each call reads the folders anew. The `limits` of the methods
 /// bound the size of a file and what a scene or script may contain. Clones share the scenes that were loaded.
 #[derive(Debug, Clone)]
 pub struct Catalog {
     scenes: Collection,
     scripts: Collection,
+    exercises: Collection,
     /// Built-in scenes that were loaded before, by name: laying out an organ takes about a second.
     built_in: Arc<Mutex<Vec<(String, Scene)>>>,
 }
 
 impl Catalog {
-    /// Creates the catalog of the built-in scenes and scripts, and of two folders: that of scenes, and that of
-    /// scripts. Either folder may be missing. Reads nothing yet.
-    pub fn new(scenes: &Path, scripts: &Path) -> Self {
+    /// Creates the catalog of the built-in scenes, scripts and exercises, and of three folders: that of scenes, that of
+    /// scripts, and that of exercises. Each folder may be missing. Reads nothing yet.
+    pub fn new(scenes: &Path, scripts: &Path, exercises: &Path) -> Self {
         Catalog {
             scenes: Collection::new(TextKind::Scene, scenes),
             scripts: Collection::new(TextKind::Script, scripts),
+            exercises: Collection::new(TextKind::Exercise, exercises),
             built_in: Arc::default(),
         }
     }
@@ -40,10 +43,10 @@ impl Catalog {
         self.scenes.names(limits)
     }
 
-    /// Returns a refusal for each script in the folder of scenes, then for each scene in the folder of scripts, each
+    /// Returns a refusal for each file of another kind in the folders of scenes, scripts and exercises, each
     /// sorted by name. The catalog does not list or load such files.
     pub fn misplaced(&self, limits: &Limits) -> Vec<Refusal> {
-        [&self.scenes, &self.scripts].into_iter().flat_map(|all| all.all_misplaced(limits)).collect()
+        [&self.scenes, &self.scripts, &self.exercises].into_iter().flat_map(|all| all.all_misplaced(limits)).collect()
     }
 
     /// Returns the names, sorted, of the scenes that are not exactly a built-in one: those of files with another name
@@ -62,6 +65,23 @@ impl Catalog {
     /// The scripts are not validated, and the scene need not exist.
     pub fn script_names_for(&self, scene: &str, limits: &Limits) -> Vec<String> {
         self.scripts.names_where(&self.scenes, limits, |_, text| fits(text, scene))
+    }
+
+    /// Returns the valid exercises, sorted by name.
+    pub fn exercises(&self, limits: &Limits) -> Vec<Exercise> {
+        let read = |name: &String| {
+            let (file, text) = self.exercise_text(name, limits).ok()?;
+            Exercise::parse(&file, &text).ok()
+        };
+        self.exercises.names(limits).iter().filter_map(read).collect()
+    }
+
+    /// Returns the text of the exercise named `name`, and the name of its file for refusals.
+    ///
+    /// # Errors
+    /// Refuses an unknown name, and a file that can't be read or is no exercise. The text is not checked.
+    pub fn exercise_text(&self, name: &str, limits: &Limits) -> Result<(String, String)> {
+        self.exercises.text(name, &self.scenes, limits)
     }
 
     /// Loads the scene named `name`; `assignments` ("key=value") override its keys. Keeps a built-in scene without

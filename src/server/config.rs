@@ -51,6 +51,8 @@ pub struct Config {
     pub scenes: PathBuf,
     /// Folder of the scripts that clients can request by name. Default: `scripts`; it may be missing.
     pub scripts: PathBuf,
+    /// Folder of the exercises that clients can create sessions for by name. Default: `exercises`; it may be missing.
+    pub exercises: PathBuf,
     /// Folder of the page served at `/`, built by `npm run build`. Default: `clients/viewer/dist`.
     pub viewer: PathBuf,
     /// Number of stepping threads; 0 (default): one fewer than the cores of the machine, at least 1.
@@ -104,6 +106,7 @@ impl Default for Config {
             otlp: None,
             scenes: PathBuf::from("scenes"),
             scripts: PathBuf::from("scripts"),
+            exercises: PathBuf::from("exercises"),
             viewer: PathBuf::from("clients/viewer/dist"),
             threads: 0,
             network_threads: 0,

@@ -16,9 +16,9 @@ use tonic_types::StatusExt;
 use tracing::{Instrument, debug};
 
 use super::job_pool::{CancelFlag, JobPool, Urgency};
+use super::trainee::Seat;
 use palpate_haptics::{Law, Tip, TipShape};
 use palpate_proto::{pb, touch};
-use palpate_realtime::SessionHandle;
 use palpate_realtime::law_cache::{SoughtLaw, have_same_laws};
 use palpate_session::Sample;
 use palpate_session::budget::Account;
@@ -107,7 +107,7 @@ struct Known {
 struct Maker {
     job_pool: JobPool,
     account: Account,
-    handle: Arc<SessionHandle>,
+    seat: Seat,
     shape: TipShape,
 }
 
@@ -120,16 +120,25 @@ impl Maker {
         Arc::new(force_law::of_tip(model, Law::clone(&law), self.shape, disc.radius_m))
     }
 
+    /// Returns the law of `disc`: for a caller from whom something is hidden, that of the tissue without it.
+    fn sought(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>, Status> {
+        let law = match self.seat.hidden() {
+            Some(_) => self.seat.handle.plain_law(disc),
+            None => self.seat.handle.law(model, disc),
+        };
+        Ok(law?)
+    }
+
     /// Computes the first law of `disc`: at most 50 ms of work.
     async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
-        let sought = self.handle.law(model, disc)?;
+        let sought = self.sought(model, disc)?;
         let law = self.job_pool.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??;
         Ok(self.of_tip(law, model, disc))
     }
 
     /// Computes the exact law of `disc`, depth by depth. Between two depths other work can run, also of this caller.
     async fn exact(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
-        let sought = self.handle.law(model, disc)?;
+        let sought = self.sought(model, disc)?;
         let _turn = sought.turn().await;
         let mut computation = None;
         loop {
@@ -179,7 +188,7 @@ impl Maker {
         tell: &mpsc::Sender<LawUpdate>,
     ) {
         if let Err(status) = &law {
-            debug!(session = %self.handle.id, message = status.message(), "a force law can't be had");
+            debug!(session = %self.seat.handle.id, message = status.message(), "a force law can't be had");
         }
         let number = known.number.wrapping_add(u32::from(law.is_ok()));
         // The stream may have ended; then the update is dropped.
@@ -196,19 +205,19 @@ pub(super) struct Computing {
 }
 
 impl Computing {
-    /// Computes the first law for a stream of `handle` with the tip `tip`. Returns it with the computation of the later laws.
+    /// Computes the first law for a stream of a session with the tip `tip`. Returns it with the computation of the later laws.
     ///
     /// # Errors
     /// Returns an error if no law can be computed now: for lack of memory, work or time.
     pub(super) async fn begin(
         job_pool: &JobPool,
         account: &Account,
-        handle: &Arc<SessionHandle>,
+        seat: &Seat,
         Tip { shape, radius_m, .. }: Tip,
     ) -> Result<(Arc<Law>, Self), Status> {
-        let mut tissue = handle.tissue();
+        let mut tissue = seat.hidden().map_or_else(|| seat.handle.tissue(), |exercise| exercise.plain_tissue());
         let model = tissue.borrow_and_update().1.clone();
-        let maker = Maker { job_pool: job_pool.clone(), account: account.clone(), handle: handle.clone(), shape };
+        let maker = Maker { job_pool: job_pool.clone(), account: account.clone(), seat: seat.clone(), shape };
         let disc = Disc::in_middle(&model, radius_m);
         let law = maker.first(&model, disc).await?;
         let known = Known { number: FIRST, model, disc, is_coarse: law.is_coarse, has_places: true };
@@ -257,7 +266,7 @@ impl Computing {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use palpate_realtime::Pacer;
+    use palpate_realtime::{Pacer, SessionHandle};
     use palpate_session::budget::Budget;
     use palpate_tissue::limits::Limits;
     use palpate_tissue::scene::{Change, PAPER, Scene};
@@ -298,7 +307,9 @@ mod tests {
 
         /// The laws of a new stream.
         async fn begin(&self) -> (Arc<Law>, Arc<Laws>, Computing) {
-            let begun = Computing::begin(&self.job_pool, &self.account, &self.handle, self.tip()).await;
+            let begun =
+                Computing::begin(&self.job_pool, &self.account, &Seat::of_trainer(self.handle.clone()), self.tip())
+                    .await;
             let (law, computing) = begun.unwrap();
             (law.clone(), Arc::new(Laws::new(law)), computing)
         }

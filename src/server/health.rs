@@ -8,22 +8,25 @@ use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 use tracing::warn;
 
+use super::exercises::Exercises;
 use super::haptics::Haptics;
 use super::job_pool::JobPool;
 use super::protection::Protection;
 use super::sessions::Sessions;
 use super::traffic::Traffic;
 use super::views::Views;
+use palpate_proto::pb::exercise_service_server::ExerciseServiceServer;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
 use palpate_proto::pb::session_service_server::SessionServiceServer;
 use palpate_proto::pb::view_service_server::ViewServiceServer;
 
 /// The services that the health service reports. The server itself, "", is serving even if one of the others is not.
-pub(super) const SERVICES: [&str; 6] = [
+pub(super) const SERVICES: [&str; 7] = [
     "",
     <SessionServiceServer<Sessions> as NamedService>::NAME,
     <HapticServiceServer<Haptics> as NamedService>::NAME,
     <ViewServiceServer<Views> as NamedService>::NAME,
+    <ExerciseServiceServer<Exercises> as NamedService>::NAME,
     TOKENS,
     JOB_POOL,
 ];

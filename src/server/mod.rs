@@ -13,6 +13,8 @@ mod connections;
 mod cpu_account;
 mod datagrams;
 mod descriptors;
+mod exercise_message;
+mod exercises;
 mod fleet;
 mod force_law;
 pub mod frame_message;
@@ -47,6 +49,7 @@ mod topology_parts;
 #[cfg(feature = "otlp")]
 pub mod traces;
 mod traffic;
+mod trainee;
 mod transport;
 mod uploads;
 mod validity;

@@ -30,9 +30,10 @@ use super::services::Services;
 use super::session_instruments::SessionInstruments;
 use super::textures::Textures;
 use super::traffic::Traffic;
-use super::{admin, connections, descriptors, haptics, metrics, nodes, page, sessions, textures, views};
+use super::{admin, connections, descriptors, exercises, haptics, metrics, nodes, page, sessions, textures, views};
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminServiceServer;
+use palpate_proto::pb::exercise_service_server::ExerciseServiceServer;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
 use palpate_proto::pb::node_service_server::NodeServiceServer;
 use palpate_proto::pb::session_service_server::SessionServiceServer;
@@ -126,7 +127,7 @@ async fn run(
         pacer.measure_stages();
     }
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
-    let catalog = Catalog::new(&config.scenes, &config.scripts);
+    let catalog = Catalog::new(&config.scenes, &config.scripts, &config.exercises);
     for name in catalog.foreign_names(&config.limits) {
         if let Err(refusal) = catalog.load(&name, &[], &config.limits) {
             warn!(%refusal, "this scene is invalid: no session can be created from it");
@@ -248,6 +249,7 @@ async fn run(
         let sessions = sessions::Sessions(services.clone());
         NodeServiceServer::new(nodes::Nodes { sessions, fleet }).max_decoding_message_size(fleet::MAX_MESSAGE_BYTES)
     });
+    let exercises = ExerciseServiceServer::new(exercises::Exercises(services.clone())).max_decoding_message_size(bytes);
     let views = ViewServiceServer::new(views::Views(services)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
@@ -255,6 +257,7 @@ async fn run(
         .add_service(sessions)
         .add_service(haptics)
         .add_service(views)
+        .add_service(exercises)
         .add_service(admin);
     let routes = match node_calls {
         Some(calls) => routes.add_service(calls),

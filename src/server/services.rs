@@ -13,6 +13,7 @@ use super::session_instruments::SessionInstruments;
 use super::status;
 use super::textures::Textures;
 use super::traffic::Traffic;
+use super::trainee::{Seat, not_for_trainee};
 use palpate_proto::pb;
 use palpate_realtime::{Pacer, SessionHandle};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -46,7 +47,35 @@ impl Services {
             (Err(unknown), Some(fleet)) if unknown.reason == Reason::UnknownSession => {
                 Err(fleet.refuse(id, unknown).await)
             }
+            (Err(_), None) if self.pacer.get_for_trainee(id).is_some() => Err(not_for_trainee()),
             (found, _) => found,
+        }
+    }
+
+    /// Returns the session that an ID opens for a call, as its trainer or a trainee.
+    ///
+    /// # Errors
+    /// Returns the refusals of [`Services::session`], and refuses a call that a trainee's ID does not open.
+    pub(super) async fn seat(&self, call: &str, id: &str) -> Result<Seat> {
+        match self.pacer.get_for_trainee(id) {
+            Some(handle) => Seat::of_trainee(handle?, call),
+            None => self.session(id).await.map(Seat::of_trainer),
+        }
+    }
+
+    /// Refuses a trainee's ID in a call about the recording of a session.
+    ///
+    /// # Errors
+    /// Refuses the ID of a trainee ([`Reason::NotForTrainee`]).
+    pub(super) fn check_not_for_trainee(&self, id: &str) -> Result<()> {
+        self.pacer.get_for_trainee(id).map_or(Ok(()), |_| Err(not_for_trainee()))
+    }
+
+    /// Returns a session as the message that a caller receives, by the ID that it has sent.
+    pub(super) fn told_to(&self, seat: &Seat) -> pb::Session {
+        match &seat.trainee {
+            Some(exercise) => status::of_trainee(&seat.handle, exercise),
+            None => self.told(&seat.handle),
         }
     }
 

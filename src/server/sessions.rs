@@ -13,14 +13,16 @@ use tracing::{info, warn};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
+use super::exercises;
 use super::job_pool::CancelFlag;
 use super::journals;
 use super::meshes;
 use super::services::Services;
 use super::status;
 use super::stream_termination::until_cut;
+use super::trainee::unlisted;
 use palpate_realtime::clock::now_ns;
-use palpate_realtime::{SessionReservation, StreamKind};
+use palpate_realtime::{SessionHandle, SessionReservation, StreamKind};
 use palpate_refusal::{Reason, Refusal, number};
 use palpate_session::budget::{Account, Purpose, Resource, Work};
 use palpate_session::wire;
@@ -46,6 +48,9 @@ impl Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
+        if let Some(Source::Journal(moment)) = &request.source {
+            self.0.check_not_for_trainee(&moment.session_id)?;
+        }
         // Reading and compiling a large tissue takes a while.
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
@@ -69,12 +74,20 @@ impl Sessions {
                     let made = wire::scene::from_scene(scene, mesh.as_deref());
                     made.map_err(|refusal| refusal.within("scene"))?
                 }
+                Some(Source::Exercise(exercise)) => {
+                    let (how, services) = ((request.paused, idle_timeout_s), (&catalog, &*pacer, &config.limits));
+                    return exercises::create(exercise, services, named, how, &payer, cancel);
+                }
                 Some(Source::Journal(moment)) => {
                     let how = (request.paused, idle_timeout_s);
                     return recorded.begin(moment, named, how, (&payer, &pacer), &config.limits, cancel.flag());
                 }
                 None => {
-                    return Err(Refusal::new(Reason::Missing, "source", "scene_name, scene or journal is missing"));
+                    return Err(Refusal::new(
+                        Reason::Missing,
+                        "source",
+                        "scene_name, scene, journal or exercise is missing",
+                    ));
                 }
             };
             pacer.create_as(named, &scene, (request.paused, idle_timeout_s), &payer, cancel.flag())
@@ -121,6 +134,9 @@ impl SessionService for Sessions {
         }
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
+        if self.0.fleet.is_some() {
+            exercises::check_no_fleet(&request)?;
+        }
         if let Some(fleet) = &self.0.fleet
             && let Some(created) = fleet.create_elsewhere(&request, &account).await
         {
@@ -177,7 +193,11 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::ListJournalsResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let (recorded, pacer) = (self.0.recorded.clone(), self.0.pacer.clone());
-        Ok(Response::new(self.0.job_pool.work(&account, move |_: &CancelFlag| recorded.list(&pacer)).await??))
+        let mut answer = self.0.job_pool.work(&account, move |_: &CancelFlag| recorded.list(&pacer)).await??;
+        for handle in self.0.pacer.list().iter().filter(|handle| unlisted(handle, request.extensions()).is_some()) {
+            answer.journals.retain(|journal| journal.session_id != handle.id);
+        }
+        Ok(Response::new(answer))
     }
 
     async fn get_journal(
@@ -186,6 +206,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::GetJournalResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let (recorded, pacer, request) = (self.0.recorded.clone(), self.0.pacer.clone(), request.into_inner());
+        self.0.check_not_for_trainee(&request.session_id)?;
         let tell = move |_: &CancelFlag| recorded.told(&request, &pacer);
         Ok(Response::new(self.0.job_pool.work(&account, tell).await??))
     }
@@ -195,7 +216,7 @@ impl SessionService for Sessions {
         request: Request<pb::SaveSnapshotRequest>,
     ) -> Result<Response<Self::SaveSnapshotStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let handle = self.0.session(&request.get_ref().session_id).await?;
+        let handle = self.0.seat("SaveSnapshot", &request.get_ref().session_id).await?.handle;
         let bytes = 4 * handle.model.state_bytes() + handle.model.bytes();
         let taken = account.take(Resource::Memory(Purpose::Records), bytes, "session_id")?;
         let present = handle.save().await?;
@@ -213,15 +234,19 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetSessionRequest>,
     ) -> Result<Response<pb::GetSessionResponse>, Status> {
-        let handle = self.0.session(&request.get_ref().session_id).await?;
-        Ok(Response::new(pb::GetSessionResponse { session: Some(self.0.told(&handle)) }))
+        let seat = self.0.seat("GetSession", &request.get_ref().session_id).await?;
+        Ok(Response::new(pb::GetSessionResponse { session: Some(self.0.told_to(&seat)) }))
     }
 
     async fn list_sessions(
         &self,
-        _: Request<pb::ListSessionsRequest>,
+        request: Request<pb::ListSessionsRequest>,
     ) -> Result<Response<pb::ListSessionsResponse>, Status> {
-        let without_scene = |handle: &Arc<_>| pb::Session { scene: None, ..self.0.told(handle) };
+        let told = |handle: &Arc<SessionHandle>| match unlisted(handle, request.extensions()) {
+            Some(exercise) => status::of_trainee(handle, exercise),
+            None => self.0.told(handle),
+        };
+        let without_scene = |handle: &Arc<_>| pb::Session { scene: None, ..told(handle) };
         let served = self.0.pacer.list().into_iter().filter(|handle| !handle.is_coming());
         let sessions = served.map(|handle| without_scene(&handle)).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions }))
@@ -248,6 +273,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::DeleteJournalResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let id = request.into_inner().session_id;
+        self.0.check_not_for_trainee(&id)?;
         let (recorded, pacer) = (self.0.recorded.clone(), self.0.pacer.clone());
         let remove = move |_: &CancelFlag| recorded.remove(&id, &pacer);
         let files = self.0.job_pool.work(&account, remove).await??;
@@ -259,7 +285,7 @@ impl SessionService for Sessions {
         request: Request<pb::StartSessionRequest>,
     ) -> Result<Response<pb::StartSessionResponse>, Status> {
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("StartSession", &request.session_id).await?.handle;
         let step = self.0.pacer.start_session(&handle, request.until_step).await?;
         Ok(Response::new(pb::StartSessionResponse { step }))
     }
@@ -305,7 +331,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::GetStateHashResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("GetStateHash", &request.session_id).await?.handle;
         // A request for the current hash waits for its caller's share. A request for a later step must reach that
         // step.
         let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
@@ -332,7 +358,7 @@ impl SessionService for Sessions {
         let script_names = if session_id.is_empty() {
             self.0.catalog.script_names(&self.0.config.limits)
         } else {
-            let handle = self.0.session(&session_id).await?;
+            let handle = self.0.seat("ListScripts", &session_id).await?.handle;
             self.0.catalog.script_names_for(&handle.model.scene.name, &self.0.config.limits)
         };
         Ok(Response::new(pb::ListScriptsResponse { script_names }))
@@ -344,7 +370,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<Self::GetScriptStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("GetScript", &request.session_id).await?.handle;
         let guard = handle.open_stream("GetScript", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());

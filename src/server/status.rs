@@ -1,10 +1,11 @@
 //! Converts a session to its message: its state, counts, audits and tissue.
 
+use super::exercise_message;
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 use palpate_realtime::event_log::EventLog;
 use palpate_realtime::playback::Playback;
-use palpate_realtime::{RunState, SessionHandle};
+use palpate_realtime::{LiveExercise, RunState, SessionHandle};
 use palpate_session::wire;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::{AuditedError, StageTime};
@@ -70,9 +71,45 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
         mesh_error_estimate: mesh_error(handle),
         journal: handle.event_log.as_deref().map(journal),
         playback: handle.playback.as_ref().map(playback),
+        exercise: handle.exercise.as_ref().map(|exercise| exercise_message::of_session(exercise, false)),
         ..Default::default()
     };
     with_model(session, model)
+}
+
+/// Returns the current state of a session that is made for an exercise, for a trainee. What follows from its model is that of the tissue
+/// without what is hidden, and each other field is named here: a new one is hidden until it is added.
+pub(super) fn of_trainee(handle: &SessionHandle, exercise: &LiveExercise) -> pb::Session {
+    let of_trainer = session(handle);
+    let told = pb::Session {
+        session_id: exercise.trainee_id.clone(),
+        state: of_trainer.state,
+        step: of_trainer.step,
+        simulation_time_s: of_trainer.simulation_time_s,
+        overrun_count: of_trainer.overrun_count,
+        time_dilation: of_trainer.time_dilation,
+        late_commands: of_trainer.late_commands,
+        paused_commands: of_trainer.paused_commands,
+        hold_reason: of_trainer.hold_reason,
+        held_tools: of_trainer.held_tools,
+        lapsed_leases: of_trainer.lapsed_leases,
+        idle_timeout_s: of_trainer.idle_timeout_s,
+        recovery_count: of_trainer.recovery_count,
+        resting: of_trainer.resting,
+        commands: of_trainer.commands,
+        topology_version: of_trainer.topology_version,
+        severed: of_trainer.severed,
+        pieces: of_trainer.pieces,
+        cuts_exhausted: of_trainer.cuts_exhausted,
+        ties: of_trainer.ties,
+        streams: of_trainer.streams,
+        scene_name: of_trainer.scene_name,
+        points: of_trainer.points,
+        extent: of_trainer.extent,
+        exercise: Some(exercise_message::of_session(exercise, true)),
+        ..Default::default()
+    };
+    with_model(told, &exercise.plain)
 }
 
 fn stage_time(StageTime { stage, time_s }: StageTime) -> pb::StageTime {

@@ -93,7 +93,7 @@ impl ViewService for Views {
     async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("GetMesh", &request.session_id).await?.handle;
         let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
         let guard = handle.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
@@ -110,7 +110,7 @@ impl ViewService for Views {
     ) -> Result<Response<Self::GetTopologyStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let pb::GetTopologyRequest { session_id, since_version } = request.into_inner();
-        let handle = self.0.session(&session_id).await?;
+        let handle = self.0.seat("GetTopology", &session_id).await?.handle;
         let guard = handle.open_stream("GetTopology", StreamKind::ReadsOnly, &account)?;
         let parts = move |_: &CancelFlag| TopologyParts::new(&handle, since_version);
         let parts = self.0.job_pool.work(&account, parts).await?;
@@ -120,7 +120,7 @@ impl ViewService for Views {
     async fn get_wound(&self, request: Request<pb::GetWoundRequest>) -> Result<Response<Self::GetWoundStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let pb::GetWoundRequest { session_id, refinement, since_version } = request.into_inner();
-        let handle = self.0.session(&session_id).await?;
+        let handle = self.0.seat("GetWound", &session_id).await?.handle;
         let grid = Refinement::new(&handle.model.scene, refinement, &self.0.config.limits)?;
         let guard = handle.open_stream("GetWound", StreamKind::ReadsOnly, &account)?;
         let parts = move |_: &CancelFlag| WoundParts::new(&handle, grid, since_version);
@@ -134,10 +134,10 @@ impl ViewService for Views {
     ) -> Result<Response<Self::GetTextureStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let guard =
-            self.0.session(&request.session_id).await?.open_stream("GetTexture", StreamKind::ReadsOnly, &account)?;
+        let handle = self.0.seat("GetTexture", &request.session_id).await?.handle;
+        let guard = handle.open_stream("GetTexture", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let Texture { png, etag } = self.0.textures.texture(&request.session_id).await?;
+        let Texture { png, etag } = self.0.textures.texture(&handle.id).await?;
         let png = if etag == request.known_etag { Bytes::new() } else { png };
         // An empty texture still has one part.
         let rest = Some((png, etag, guard));
@@ -157,7 +157,7 @@ impl ViewService for Views {
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("WatchFrames", &request.session_id).await?.handle;
         let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
         let encoding = wire::sample::from_encoding(request.encoding)?;
         let most_hz = handle.model.scene.stepping.rate_hz;

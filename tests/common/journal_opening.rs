@@ -18,5 +18,6 @@ pub fn opening(first: &Arc<Model>) -> Opening<'_> {
         running: true,
         until_step: None,
         ownership_revision: 0,
+        exercise: None,
     }
 }

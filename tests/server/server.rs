@@ -30,6 +30,7 @@ mod budget;
 mod datagrams;
 mod devices;
 mod etcd;
+mod exercises;
 mod fleet;
 mod fleet_chaos;
 mod follow;

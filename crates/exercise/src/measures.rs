@@ -1,6 +1,7 @@
 //! All measures of a session, step by step: of each tool, of all together, of the surface, and the force over time.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use glam::DVec3;
 
@@ -55,7 +56,8 @@ pub struct Measures {
     /// Whether a tool that left in the present window had moved in it.
     has_moved: bool,
     tools: BTreeMap<u32, ToolMeasures>,
-    surface: PressedSurface,
+    /// Shared with a copy of the measures until it changes.
+    surface: Arc<PressedSurface>,
     timeline: Timeline,
 }
 
@@ -78,7 +80,7 @@ impl Measures {
             idle_windows: 0,
             has_moved: false,
             tools: BTreeMap::new(),
-            surface: PressedSurface::new(triangles_m),
+            surface: Arc::new(PressedSurface::new(triangles_m)),
             timeline: Timeline::new(rate_hz, begin_step),
         }
     }
@@ -124,7 +126,7 @@ impl Measures {
             ended.extend(results);
         }
         for disc in ended.iter().filter_map(|result| result.disc) {
-            self.surface.press(&disc);
+            Arc::make_mut(&mut self.surface).press(&disc);
         }
     }
 

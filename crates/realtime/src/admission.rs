@@ -10,7 +10,9 @@ use super::audited::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
 use super::event_log::{About, EventLog};
+use super::exercise_task::{ExerciseTask, MEASURES_BYTES};
 use super::law_cache::LawCache;
+use super::live_exercise::{LiveExercise, SessionExercise};
 use super::pacer::Pacer;
 use super::playback::Playback;
 use super::session_handle::SessionHandle;
@@ -21,6 +23,7 @@ use crate::ids::random_id;
 use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_session::Session;
 use palpate_session::budget::{Account, Purpose, Resource, Taken};
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::schedule::Schedule;
@@ -58,6 +61,8 @@ pub struct Begin {
     /// Whether the session's events are written to an event log, if the server keeps journals. A playback is never
     /// recorded.
     pub recorded: bool,
+    /// The exercise that the session is made for, if any; it begins with the session.
+    pub exercise: Option<SessionExercise>,
 }
 
 /// A reserved ID for a new session, for [`Pacer::create_as`]. In a fleet, the ID is already this server's key in
@@ -131,10 +136,7 @@ impl Pacer {
     ) -> Result<Arc<SessionHandle>> {
         // Taken before any work is done for it.
         let slot = owner.take(Resource::Sessions, 1, "")?;
-        let most_hz = self.limits.session_rate_hz;
-        number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
-        check_asked(scene, &self.limits)?;
-        let model = memory::attempt(scene.body.kind().points_key(), || self.compile(scene, stop))?;
+        let model = self.model_of(scene, stop)?;
         let begin = Begin {
             id,
             first: model.clone(),
@@ -147,8 +149,62 @@ impl Pacer {
             waiting: Vec::new(),
             frozen: false,
             recorded,
+            exercise: None,
         };
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
+    }
+
+    /// Creates a session for an exercise, as [`Pacer::create_as`] does. `scene` has the exercise's truth in it.
+    ///
+    /// # Errors
+    /// Returns the refusals of [`Pacer::create_as`], and refuses an exercise that does not fit the tissue.
+    pub fn create_exercise(
+        &self,
+        reservation: SessionReservation,
+        scene: &Scene,
+        chosen: ChosenExercise,
+        (paused, idle_timeout_s): (bool, f64),
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<SessionHandle>> {
+        let slot = owner.take(Resource::Sessions, 1, "")?;
+        let model = self.model_of(scene, stop)?;
+        let plain = self.plain_of(&chosen, &model, stop)?;
+        let SessionReservation { id, revision, recorded } = reservation;
+        let begin = Begin {
+            id,
+            first: model.clone(),
+            running: !paused,
+            until: None,
+            idle_timeout_s,
+            playback: None,
+            after_run: 0,
+            revision,
+            waiting: Vec::new(),
+            frozen: false,
+            recorded,
+            exercise: Some(SessionExercise { chosen, trainee_id: random_id()?, plain, ended: None }),
+        };
+        self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
+    }
+
+    /// Compiles the tissue of an exercise without what it hides; `model` has it in it.
+    ///
+    /// # Errors
+    /// Refuses a tissue that can't be compiled, missing memory, and a set `stop`.
+    pub fn plain_of(&self, chosen: &ChosenExercise, model: &Arc<Model>, stop: &AtomicBool) -> Result<Arc<Model>> {
+        if !chosen.exercise.hides_truth() {
+            return Ok(model.clone());
+        }
+        self.model_of(&model.scene.without_inclusions()?, stop)
+    }
+
+    /// Compiles a scene, after checking that a server steps such scenes.
+    fn model_of(&self, scene: &Scene, stop: &AtomicBool) -> Result<Arc<Model>> {
+        let most_hz = self.limits.session_rate_hz;
+        number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
+        check_asked(scene, &self.limits)?;
+        memory::attempt(scene.body.kind().points_key(), || self.compile(scene, stop))
     }
 
     /// Creates a session that continues a saved one, or plays a recording. `session` returns the saved session, and
@@ -197,6 +253,7 @@ impl Pacer {
             waiting,
             frozen,
             recorded,
+            exercise,
         } = begin;
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
@@ -204,7 +261,8 @@ impl Pacer {
         let points_key = first.scene.body.kind().points_key();
         let skin = memory::attempt(points_key, || Ok(Skin::of(&first)))?;
         first.shape().prepare_contact();
-        let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
+        let of_exercise = exercise.as_ref().map_or(0, |exercise| exercise.plain.session_bytes() + MEASURES_BYTES);
+        let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes()) + of_exercise;
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, points_key)?;
         // Allocated before the lock is taken, which every call needs.
         let mut session = memory::attempt(points_key, session)?;
@@ -257,6 +315,10 @@ impl Pacer {
             let message = "this session plays a recording; to touch the tissue, begin a session at one of its moments (CreateSession)";
             drop(intake.close(Refusal::new(Reason::NotAvailable, "session_id", message)));
         }
+        let ended = exercise.as_ref().and_then(|exercise| exercise.ended.as_ref()).map(|ended| ended.figures.clone());
+        let exercise = exercise.map(|exercise| Arc::new(LiveExercise::new(exercise, step)));
+        let measured = exercise.as_ref().filter(|_| ended.is_none());
+        let measuring = measured.map(|live| ExerciseTask::new(live, &session).map(Box::new)).transpose()?;
         let about = || About {
             id: id.clone(),
             owner: owner.name().to_owned(),
@@ -267,6 +329,7 @@ impl Pacer {
             until_step: until,
             after_run,
             revision,
+            exercise: exercise.as_ref().map(|live| live.chosen.recorded(&live.trainee_id)),
         };
         // A playback is already recorded.
         let event_log =
@@ -294,6 +357,7 @@ impl Pacer {
             thread: AtomicUsize::new(thread),
             inbox: stepper.inbox.clone(),
             event_log,
+            exercise,
             playback,
             slot: Mutex::new(slot),
             _memory: memory,
@@ -306,6 +370,9 @@ impl Pacer {
             memory::attempt(points_key, || Ok(Box::new(SessionTask::new(handle.clone(), session, running))))?;
         running.until = until;
         running.frozen = frozen;
+        running.exercise = measuring;
+        // The next run of the journal needs it as well.
+        ended.into_iter().for_each(|figures| running.note_input(Input::ExerciseEnded(figures)));
         running.publish_status();
         if stop.load(Ordering::Relaxed) {
             return Err(scheme_selection::given_up());
@@ -315,6 +382,9 @@ impl Pacer {
         if points + handle.model.len() > self.limits.points_in_all {
             let message = format!("the sessions of the server already have {points} points");
             return Err(Refusal::new(Reason::TooMany, points_key, message));
+        }
+        if let Some(exercise) = &handle.exercise {
+            lock(&self.trainees).insert(exercise.trainee_id.clone(), id.clone());
         }
         sessions.insert(id, handle.clone());
         // No caller can name the session before this, so every request to it comes after this.
@@ -326,8 +396,10 @@ impl Pacer {
     fn compile(&self, scene: &Scene, stop: &AtomicBool) -> Result<Arc<Model>> {
         let known = lock(&self.sessions)
             .values()
-            .find(|handle| handle.model.scene == *scene)
-            .map(|handle| handle.model.clone());
+            .flat_map(|handle| [Some(&handle.model), handle.exercise.as_ref().map(|exercise| &exercise.plain)])
+            .flatten()
+            .find(|model| model.scene == *scene)
+            .cloned();
         known.map_or_else(|| Model::compile_until(scene, &self.limits, stop), Ok)
     }
 

@@ -15,6 +15,7 @@ use tokio::sync::watch;
 use super::clock::now_ns;
 use super::inbox::Leaving;
 use palpate_session::input::{Felt, Input};
+use palpate_session::journal::pb::RecordedExercise;
 use palpate_session::snapshot::Saved;
 use palpate_tissue::lock::lock;
 use palpate_tissue::{Model, ReadCopy};
@@ -152,6 +153,8 @@ pub struct About {
     pub after_run: u64,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
+    /// The exercise that the session is made for, as its journal has it; `None` for any other session.
+    pub exercise: Option<RecordedExercise>,
 }
 
 /// Event log of one session: the events that its journal does not have yet, and which steps are on disk. The stepping
@@ -497,6 +500,7 @@ mod tests {
             until_step: None,
             after_run: 0,
             revision: 0,
+            exercise: None,
         };
         let log = EventLog::new(&Arc::default(), about);
         let fill = |count: usize| (0..count).for_each(|_| log.note(1, Event::Left(Leaving::Deleted)));

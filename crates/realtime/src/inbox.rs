@@ -9,6 +9,7 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
+use super::live_exercise::EndedExercise;
 use super::reading::HashReply;
 use super::subscribers::{ProbeTap, SampleTap};
 use super::thread_counters::ThreadCounters;
@@ -77,6 +78,10 @@ pub(super) enum Request {
         account: Account,
         reply: HashReply,
     },
+    /// Ends the session's exercise now.
+    FinishExercise,
+    /// The result of the session's exercise is known.
+    ExerciseEnded(Arc<EndedExercise>),
     /// Removes the session from this server: it is deleted, or has another owner.
     Leave(Refusal, Leaving),
     /// Moves the session to the thread of lower priority.

@@ -40,6 +40,8 @@ pub struct Pacer {
     reading: Arc<Reading>,
     threads: Mutex<Vec<JoinHandle<()>>>,
     pub(super) sessions: Sessions,
+    /// The IDs of sessions by those that open them for a trainee.
+    pub(super) trainees: Mutex<BTreeMap<String, String>>,
     auditor: Arc<Auditor>,
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
@@ -119,6 +121,7 @@ impl Pacer {
             reading,
             threads: Mutex::new(handles),
             sessions,
+            trainees: Mutex::new(BTreeMap::new()),
             auditor,
             viewers: Mutex::new(BTreeMap::new()),
             numbers: Mutex::new(0),
@@ -159,6 +162,15 @@ impl Pacer {
         }
         handle.asked_ns.store(now_ns(), Ordering::Relaxed);
         Ok(handle)
+    }
+
+    /// Returns the session that an ID opens for a trainee, and counts the call as a use of it; `None` if it opens none.
+    ///
+    /// # Errors
+    /// Returns the refusals of [`Pacer::get`] for that session.
+    pub fn get_for_trainee(&self, trainee_id: &str) -> Option<Result<Arc<SessionHandle>>> {
+        let id = lock(&self.trainees).get(trainee_id).cloned()?;
+        Some(self.get(&id))
     }
 
     /// Returns whether the session exists, has an event log, and its journal is being written as run `run`.
@@ -220,6 +232,9 @@ impl Pacer {
 
     fn part_with(&self, id: &str, why: Refusal, leaving: Leaving) -> Result<()> {
         let handle = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
+        if let Some(exercise) = &handle.exercise {
+            lock(&self.trainees).remove(&exercise.trainee_id);
+        }
         lock(&handle.slot).shrink_to(0);
         let waited = lock(&handle.intake).close(why.clone());
         if !waited.is_empty() {

@@ -131,6 +131,8 @@ pub(super) enum Piece {
         taken: Taken,
         to: Vec<Arc<Recipient>>,
     },
+    /// A computation of some milliseconds.
+    Work(Box<dyn FnOnce() + Send>),
     /// Memory of a deleted session, to be freed.
     Remains(Box<dyn Send>),
     /// Closes a stream after its last record.
@@ -176,6 +178,10 @@ impl Piece {
                     recipient.writer.push(record.clone());
                     recipient.pending.fetch_sub(1, Ordering::AcqRel);
                 }
+                None
+            }
+            Piece::Work(work) => {
+                work();
                 None
             }
             Piece::Remains(remains) => {
@@ -247,7 +253,7 @@ impl Reading {
         let Some((account, piece)) = lock(&self.board).waiting.next(|_| true) else { return };
         let recipients = match &piece {
             Piece::Record { to, .. } => to.clone(),
-            Piece::Hash { .. } | Piece::Remains(_) | Piece::Close { .. } => Vec::new(),
+            Piece::Hash { .. } | Piece::Work(_) | Piece::Remains(_) | Piece::Close { .. } => Vec::new(),
         };
         match catch_unwind(AssertUnwindSafe(|| piece.read())) {
             Ok(None) => {}

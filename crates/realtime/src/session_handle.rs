@@ -12,6 +12,7 @@ use super::event_log::{Event, EventLog};
 use super::frames::Viewer;
 use super::inbox::{Inbox, Present, Request};
 use super::law_cache::{LawCache, SoughtLaw};
+use super::live_exercise::{EndedExercise, LiveExercise};
 use super::playback::Playback;
 use super::queue::{Reader, queue};
 use super::reading::{Recipient, SharedRecord};
@@ -75,6 +76,8 @@ pub struct SessionHandle {
     pub(super) thread: AtomicUsize,
     /// Inbox of the thread that it began on, which passes requests on if the session has moved.
     pub(super) inbox: Arc<Inbox>,
+    /// The exercise that the session is made for; `None` for any other session.
+    pub exercise: Option<Arc<LiveExercise>>,
     /// The recording that the session plays; `None` for a live session.
     pub playback: Option<Playback>,
     /// Event log for the session's journal; `None` if the server keeps no journals or does not record this session.
@@ -404,6 +407,31 @@ impl SessionHandle {
         Ok(reader)
     }
 
+    /// Ends the exercise that the session is made for, unless it has ended, and returns its result.
+    ///
+    /// # Errors
+    /// Refuses a session without an exercise ([`Reason::UnknownExercise`]), and one that is deleted or held for good meanwhile.
+    pub async fn finish_exercise(&self) -> Result<Arc<EndedExercise>> {
+        let mut news = self.live_exercise()?.news();
+        self.inbox.send(self.number, Request::FinishExercise);
+        let told = news.wait_for(|news| news.ended.is_some() || news.closed.is_some()).await;
+        let told = told.map_err(|_| deleted())?;
+        match (&told.ended, &told.closed) {
+            (Some(ended), _) => Ok(ended.clone()),
+            (None, why) => Err(why.clone().unwrap_or_else(deleted)),
+        }
+    }
+
+    /// Returns the exercise that the session is made for.
+    ///
+    /// # Errors
+    /// Refuses a session without one ([`Reason::UnknownExercise`]).
+    pub fn live_exercise(&self) -> Result<&Arc<LiveExercise>> {
+        self.exercise.as_ref().ok_or_else(|| {
+            Refusal::new(Reason::UnknownExercise, "session_id", "is a session that is not made for an exercise")
+        })
+    }
+
     /// Returns a receiver of the step from whose beginning the present tissue acts and of that tissue. It has the
     /// present value, and is updated when a change takes effect.
     pub fn tissue(&self) -> watch::Receiver<(u64, Arc<Model>)> {
@@ -417,6 +445,15 @@ impl SessionHandle {
     /// Refuses if the memory of a further law exceeds the part of the session's owner or of the system.
     pub fn law(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>> {
         self.laws.of(disc, model, self.limits.law_work, &self.owner)
+    }
+
+    /// Returns the force law of the tissue without what the session's exercise hides, as [`SessionHandle::law`] does.
+    ///
+    /// # Errors
+    /// Refuses a session without an exercise, and if the memory of a further law exceeds the part of the session's owner or of the
+    /// system.
+    pub fn plain_law(&self, disc: Disc) -> Result<Arc<SoughtLaw>> {
+        self.live_exercise()?.plain_law(disc, &self.limits, &self.owner)
     }
 
     /// Returns the force laws of the present tissue that have been computed so far, each with its disc; the most

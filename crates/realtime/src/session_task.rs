@@ -13,6 +13,7 @@ use std::sync::mpsc::SyncSender;
 
 use super::clock::{Dilation, now_ns};
 use super::event_log::Event;
+use super::exercise_task::ExerciseTask;
 use super::fence::Fence;
 use super::frames::Encoder;
 use super::inbox::{Inbox, Leaving, Present, Request};
@@ -78,6 +79,8 @@ pub(super) struct SessionTask {
     pub(super) audit: Option<SyncSender<Mark>>,
     /// Writer of the event log, if there is one.
     pub(super) recorder: Option<Recorder>,
+    /// The measuring of the session's exercise, if it is made for one.
+    pub(super) exercise: Option<Box<ExerciseTask>>,
     /// Whether it is being handed over: then no step is done unless the handover fails.
     pub(super) frozen: bool,
     pub(super) watch: StepWatch,
@@ -112,6 +115,7 @@ impl SessionTask {
             (status.schedule, status.dilation)
         };
         SessionTask {
+            exercise: None,
             recorder: handle.event_log.as_ref().map(|event_log| Recorder::new(event_log, &session)),
             running,
             until: None,
@@ -200,6 +204,7 @@ impl SessionTask {
         let step = self.session.step_count();
         let wanted = || {
             let wanted = self.subscribers.next_wanted(step, self.still_since, self.handle.model.scene.stepping.rate_hz);
+            let wanted = self.exercise.as_ref().map_or(wanted, |exercise| wanted.min(exercise.next_wanted(step)));
             self.until.map_or(wanted, |until| wanted.min(until - 1))
         };
         let rests_until = self.session.rests_until().filter(|_| self.running);
@@ -298,6 +303,17 @@ impl SessionTask {
                 } else {
                     let _ = reply.send(Err(self.passed(at)));
                 }
+            }
+            Request::FinishExercise => {
+                if let Some(exercise) = &mut self.exercise {
+                    let inbox = (self.handle.number, &self.handle.inbox);
+                    exercise.end(&self.session, inbox, &self.handle.owner, context.reading);
+                }
+            }
+            Request::ExerciseEnded(ended) => {
+                self.note_input(Input::ExerciseEnded(ended.figures.clone()));
+                tracing::info!(session = %self.handle.id, step = ended.figures.step, "exercise ended");
+                self.handle.exercise.iter().for_each(|exercise| exercise.tell_end(ended.clone()));
             }
             Request::Leave(why, leaving) => {
                 if leaving == Leaving::Moved {
@@ -423,11 +439,15 @@ impl SessionTask {
         if !self.session.is_within_step() && !self.begin_step(begun_ns, context) {
             return;
         }
-        let (SessionTask { session, subscribers, due, copies, .. }, wakes, reading) =
+        let (SessionTask { session, subscribers, due, copies, exercise, .. }, wakes, reading) =
             (&mut *self, &mut context.wakes, context.reading);
         copies.forget();
         let mut may_go_on = || now_ns() < begun_ns + MAX_REPETITION_NS;
-        if session.advance_while(due, &mut may_go_on, |session| subscribers.record(session, copies, reading, wakes)) {
+        let see = |session: &Session| {
+            subscribers.record(session, copies, reading, wakes);
+            exercise.iter_mut().for_each(|exercise| exercise.see(session));
+        };
+        if session.advance_while(due, &mut may_go_on, see) {
             self.end_step(begun_ns, context);
         }
     }
@@ -463,6 +483,9 @@ impl SessionTask {
         self.tell_auditor();
         self.log_recovery();
         self.note_state();
+        if let Some(exercise) = &mut self.exercise {
+            exercise.tell(&self.session, (self.handle.number, &self.handle.inbox), &self.handle.owner, context.reading);
+        }
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.handle.id, reason, "session held");
             self.running = false;
@@ -540,6 +563,7 @@ impl SessionTask {
 
     /// Ends every stream, and refuses the requests that wait for a step.
     fn silence(&mut self, why: &Refusal) {
+        self.handle.exercise.iter().for_each(|exercise| exercise.close(why));
         let subscribers = std::mem::take(&mut self.subscribers);
         subscribers.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
         subscribers.probes.iter().for_each(|tap| tap.recipient.writer().close(why.clone()));

@@ -76,6 +76,9 @@ reasons! {
     Unauthenticated = "UNAUTHENTICATED",
     /// The caller lacks the role that the call requires.
     RoleMissing = "ROLE_MISSING",
+    /// The session's ID is a trainee's, which does not open this call: the answer would show what the exercise hides, or the call is the
+    /// trainer's.
+    NotForTrainee = "NOT_FOR_TRAINEE",
     /// The request comes from a web page of an origin that is not allowed.
     OriginNotAllowed = "ORIGIN_NOT_ALLOWED",
     /// The sequence number is not above the previous one.

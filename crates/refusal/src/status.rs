@@ -52,7 +52,9 @@ pub fn code(reason: Reason) -> Code {
             Code::FailedPrecondition
         }
         Reason::ToolHeld => Code::AlreadyExists,
-        Reason::NotHolder | Reason::RoleMissing | Reason::OriginNotAllowed => Code::PermissionDenied,
+        Reason::NotHolder | Reason::RoleMissing | Reason::NotForTrainee | Reason::OriginNotAllowed => {
+            Code::PermissionDenied
+        }
         Reason::Unauthenticated => Code::Unauthenticated,
         Reason::StepPassed => Code::OutOfRange,
         Reason::Cut | Reason::Recovered => Code::Aborted,

@@ -1,5 +1,7 @@
 //! An exercise while it is done: its hidden truth, and how what the trainee does is judged by it.
 
+use std::sync::Arc;
+
 use glam::DVec3;
 
 use crate::Session;
@@ -15,12 +17,14 @@ use palpate_tissue::{Model, TieState};
 
 /// Judges what is done in an exercise. Show it the session after each step, with the rows of its tools
 /// ([`MeasureRecorder::rows`](crate::measure_recorder::MeasureRecorder::rows)).
+#[derive(Debug, Clone)]
 pub struct ExerciseJudge {
-    exercise: Exercise,
+    exercise: Arc<Exercise>,
     lumps: Vec<Lump>,
     tasks: TaskMeasures,
     /// The point nearest to the place that must be lifted.
     lifted: Option<PointId>,
+    rate_hz: f64,
     begin_step: u64,
     newest: u64,
     /// Number of severed springs, and the numbers of threads and clips, that were there at the beginning.
@@ -72,7 +76,8 @@ impl ExerciseJudge {
             severed_before: 0,
             ties_before: Vec::new(),
             has_acted: false,
-            exercise: exercise.clone(),
+            rate_hz: model.scene.stepping.rate_hz,
+            exercise: Arc::new(exercise.clone()),
         })
     }
 
@@ -97,11 +102,17 @@ impl ExerciseJudge {
         }
     }
 
+    /// Returns the number of steps done when the time that the trainee has is up; `None` without a limit.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn limit_step(&self) -> Option<u64> {
+        // Saturating cast.
+        let steps = |limit_s: f64| ((limit_s * self.rate_hz).ceil() as u64).max(1);
+        self.exercise.time_limit_s.map(|limit_s| self.begin_step.saturating_add(steps(limit_s)))
+    }
+
     /// Returns whether the time that the trainee has is up.
-    #[allow(clippy::cast_precision_loss)]
     pub fn is_time_up(&self, session: &Session) -> bool {
-        let time_s = (session.step_count() - self.begin_step) as f64 / session.model().scene.stepping.rate_hz;
-        self.exercise.time_limit_s.is_some_and(|limit_s| time_s >= limit_s)
+        self.limit_step().is_some_and(|step| session.step_count() >= step)
     }
 
     /// Returns the exercise.
@@ -114,9 +125,9 @@ impl ExerciseJudge {
         &self.lumps
     }
 
-    /// Returns the figures that need the truth of the exercise, so far.
-    pub fn figures(&self, session: &Session) -> Vec<Figure> {
-        self.truth(session).figures(session.model().scene.stepping.rate_hz, &self.tasks)
+    /// Returns what was done step by step.
+    pub fn tasks(&self) -> &TaskMeasures {
+        &self.tasks
     }
 
     /// Returns the score by all figures, also those that need no truth; `None` without a criterion. A trainee who has done
@@ -142,7 +153,8 @@ impl ExerciseJudge {
         (all > 0.0).then_some(ExerciseScore { percent: 100.0 * earned / all, criteria })
     }
 
-    fn truth(&self, session: &Session) -> ExerciseTruth {
+    /// Returns the truth of the exercise beside what is there now: with [`ExerciseJudge::tasks`] it gives the figures that need the truth.
+    pub fn truth(&self, session: &Session) -> ExerciseTruth {
         let seen_along = self.exercise.seen_along;
         let (targets, rules) = match &self.exercise.lumps {
             None => (Vec::new(), None),
@@ -207,6 +219,21 @@ fn check_criteria(exercise: &Exercise) -> Result<()> {
         };
         if !is_there {
             return Err(Refusal::new(Reason::Missing, field, format!("`{name}` needs {section}")));
+        }
+    }
+    for (index, name) in exercise.trainee.live_measures.iter().flatten().enumerate() {
+        let field = format!("trainee.live_measures[{index}]");
+        match register::find(name) {
+            None => {
+                let names = register::definitions().map(|definition| definition.name);
+                let message = format!("there is no measure `{name}`{}", did_you_mean(name, names));
+                return Err(Refusal::new(Reason::WrongKind, field, message));
+            }
+            Some(definition) if register::needs_truth(definition) => {
+                let message = format!("`{name}` needs the truth, which a trainee is not told before the end");
+                return Err(Refusal::new(Reason::OutOfRange, field, message));
+            }
+            Some(_) => {}
         }
     }
     Ok(())

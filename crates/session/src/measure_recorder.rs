@@ -249,6 +249,7 @@ mod tests {
             running: true,
             until_step: None,
             ownership_revision: 0,
+            exercise: None,
         };
         let mut writer = JournalWriter::new(&opening, 0);
         let began = Session::new(&model);

@@ -113,7 +113,7 @@ impl Simulation {
                 self.session.skip_to(step);
                 self.due.clear();
             }
-            Input::Start { .. } | Input::Pause | Input::DroppedSteps(_) => {}
+            Input::Start { .. } | Input::Pause | Input::DroppedSteps(_) | Input::ExerciseEnded(_) => {}
         }
     }
 

@@ -28,6 +28,7 @@ fn protocol() -> PathBuf {
 fn generate(out: &Path) -> Result<(), Box<dyn Error>> {
     let public = compiled(&[
         "palpate/v1/session.proto",
+        "palpate/v1/exercise.proto",
         "palpate/v1/haptic.proto",
         "palpate/v1/view.proto",
         "palpate/v1/admin.proto",

@@ -8,6 +8,7 @@ use palpate_exercise::MeasureOptions;
 use palpate_refusal::printable::printable;
 use palpate_tissue::files;
 
+use super::super::score::exercise::ExerciseOptions;
 use super::super::score::{Score, ScoreOptions, shown};
 use super::super::{Failure, say, write_file};
 use super::JournalSource;
@@ -164,12 +165,12 @@ fn csv(compared: &[Compared]) -> String {
 /// Compares sessions.
 pub(super) fn compare(arguments: &CompareArguments) -> Result<(), Failure> {
     let CompareArguments { files, options, csv: file, config, quiet } = arguments;
-    let options = options.checked(MeasureOptions::default())?;
+    options.checked(MeasureOptions::default())?;
     let mut compared = Vec::new();
     for path in files {
         let score = if is_journal(path) {
             let source = JournalSource { file: path.clone(), config: config.clone() };
-            let MeasuredJournal { score, damage, .. } = measure(&source, options.clone(), None, *quiet)?;
+            let MeasuredJournal { score, damage, .. } = measure(&source, options, &ExerciseOptions::default(), *quiet)?;
             if let Some((damage, until_step)) = damage {
                 say!("palpate: warning: {}: {damage}; its figures end at step {until_step}", path.display());
             }

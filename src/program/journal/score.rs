@@ -3,10 +3,10 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate_exercise::{MeasureOptions, Measures};
+use palpate_exercise::Measures;
 use palpate_session::journal::ReplayEvent;
 
-use super::super::score::exercise::{ChosenExercise, ExerciseOptions};
+use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn_of_scene};
 use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
@@ -51,20 +51,29 @@ pub(super) struct MeasuredJournal {
     pub(super) damage: Option<(String, u64)>,
 }
 
-/// Simulates a journal again, and measures it.
+/// Simulates a journal again, and measures it. A session that was made for an exercise is judged by that.
 pub(super) fn measure(
     source: &JournalSource,
-    options: MeasureOptions,
-    chosen: Option<&ChosenExercise>,
+    options: &ScoreOptions,
+    exercise: &ExerciseOptions,
     quiet: bool,
 ) -> Result<MeasuredJournal, Failure> {
+    let mut reader = source.open()?;
+    let place = source.file.display().to_string();
+    let chosen = exercise.recorded(&place, reader.header())?;
+    // What was done after the end of the exercise does not count.
+    let ends_at = match reader.header().exercise {
+        Some(_) => reader.exercise_result()?.map(|result| result.step),
+        None => None,
+    };
+    let options = options.checked(usual_thresholds(chosen.as_ref()))?;
     // Each step is a row, also where the tissue rests.
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
-    if let Some(chosen) = chosen {
-        chosen.warn_of_scene(&model.scene.name);
+    if let Some(chosen) = &chosen {
+        warn_of_scene(chosen, &model.scene.name);
     }
-    let mut recorder = ScoreRecorder::new(&model, begin, options, None, chosen)?;
+    let mut recorder = ScoreRecorder::new(&model, begin, options, None, (chosen.as_ref(), ends_at))?;
     recorder.see(replay.session());
     let last = replay.survey().until_step;
     with_progress("step", last, quiet, |progress| {
@@ -99,9 +108,7 @@ pub(super) fn measure(
 /// Measures a journal, and writes the score.
 pub(super) fn score(arguments: &ScoreArguments) -> Result<(), Failure> {
     let ScoreArguments { source, options, exercise, json, output: file, report: page, quiet } = arguments;
-    let chosen = exercise.chosen()?;
-    let MeasuredJournal { score, measures, damage } =
-        measure(source, options.checked(ChosenExercise::thresholds(chosen.as_ref()))?, chosen.as_ref(), *quiet)?;
+    let MeasuredJournal { score, measures, damage } = measure(source, options, exercise, *quiet)?;
     if let Some(page) = page {
         write_file(page, report::page(&score, &measures)?.as_bytes())?;
     }

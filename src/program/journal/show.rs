@@ -136,6 +136,10 @@ fn input(input: &pb::Input) -> String {
         Some(What::DroppedSteps(dropped)) => format!("{} late steps were dropped", dropped.steps),
         Some(What::Revive(_)) => "revived, at rest".to_owned(),
         Some(What::Hold(hold)) => format!("held: {}", hold.reason),
+        Some(What::ExerciseResult(result)) => {
+            let score = result.score_percent.map_or(String::new(), |percent| format!(", score {percent:.1} %"));
+            format!("the exercise ended at step {}{score}", result.step)
+        }
         None => "an input of a later version".to_owned(),
     }
 }
@@ -151,6 +155,7 @@ fn name(input: &pb::Input) -> &'static str {
         Some(What::DroppedSteps(_)) => "dropped_steps",
         Some(What::Revive(_)) => "revive",
         Some(What::Hold(_)) => "hold",
+        Some(What::ExerciseResult(_)) => "exercise_result",
         None => "unknown",
     }
 }

@@ -3,13 +3,15 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use palpate_exercise::{Figure, MeasureOptions};
+use palpate_exercise::MeasureOptions;
+use palpate_proto::journal as pb;
 use palpate_refusal::Refusal;
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, thresholds};
 use palpate_session::{RecordedMark, Session};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::exercise::{Exercise, Lump};
+use palpate_tissue::scene::exercise::Lump;
 use palpate_tissue::scene::exercise_reader::find_exercise;
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +19,7 @@ use super::super::scene::{SceneArguments, compile_with};
 use super::super::{Failure, say};
 
 /// Which exercise, with which hidden truth.
-#[derive(clap::Args)]
+#[derive(clap::Args, Default)]
 pub(crate) struct ExerciseOptions {
     /// An exercise file, or the name of one that is in ./exercises or built in: `lumps-1`, `lumps-2`, `lumps-3`, `palpate-all`,
     /// `cut-line`, `lift-hold`, `close-wound`. Its hidden lumps take the place of the scene's own
@@ -28,64 +30,73 @@ pub(crate) struct ExerciseOptions {
     seed: Option<u64>,
 }
 
-/// An exercise and its hidden truth.
-pub(crate) struct ChosenExercise {
-    pub(crate) exercise: Exercise,
-    pub(crate) seed: u64,
-    pub(crate) lumps: Vec<Lump>,
-}
-
 impl ExerciseOptions {
     /// Reads the exercise; `None` if none was given.
     ///
     /// # Errors
-    /// Refuses what [`find_exercise`] refuses, and a seed for whose lumps the exercise has no room.
+    /// Refuses what [`find_exercise`] and [`ChosenExercise::new`] refuse.
     pub(crate) fn chosen(&self) -> Result<Option<ChosenExercise>, Refusal> {
         let Some(path) = &self.exercise else { return Ok(None) };
-        let exercise = find_exercise(path, &Limits::default())?;
-        let seed = self.seed.unwrap_or(exercise.seed);
-        let lumps = exercise.lumps(seed).ok_or_else(|| {
-            let message = format!("{seed}: the lumps of this seed have no room in their box; take another seed");
-            Refusal::new(palpate_refusal::Reason::OutOfRange, "--seed", message)
-        })?;
-        Ok(Some(ChosenExercise { exercise, seed, lumps }))
+        let (name, text) = find_exercise(path, &Limits::default())?;
+        ChosenExercise::new(&name, &text, self.seed).map(Some).map_err(of_option)
+    }
+
+    /// Returns the exercise of a recorded session: that of its journal, if the session was made for one, or else the one that was given.
+    /// `place` names the journal.
+    ///
+    /// # Errors
+    /// Refuses what [`ExerciseOptions::chosen`] refuses, an exercise in the journal that can't be read, and one that was given and is not
+    /// that of the journal.
+    pub(crate) fn recorded(&self, place: &str, header: &pb::Header) -> Result<Option<ChosenExercise>, Refusal> {
+        let given = self.chosen()?;
+        let Some(recorded) = ChosenExercise::from_header(place, header)? else { return Ok(given) };
+        if let Some(given) = given {
+            // Without --seed, the seed is not given.
+            let seed = self.seed.unwrap_or(recorded.seed);
+            ChosenExercise { seed, ..given }.check_same(&recorded, place).map_err(of_option)?;
+        }
+        Ok(Some(recorded))
     }
 }
 
-impl ChosenExercise {
-    /// Returns the assignments by which the scene gets the hidden lumps.
-    fn assignments(&self) -> Vec<String> {
-        self.exercise.assignments(&self.lumps)
+/// Names the option in place of the field.
+fn of_option(refusal: Refusal) -> Refusal {
+    match refusal.field.as_str() {
+        "seed" | "exercise" => Refusal { field: format!("--{}", refusal.field), ..refusal },
+        _ => refusal,
     }
+}
 
-    /// Returns the thresholds of an exercise; the usual ones without an exercise.
-    pub(crate) fn thresholds(chosen: Option<&Self>) -> MeasureOptions {
-        chosen.map_or_else(MeasureOptions::default, |chosen| thresholds(&chosen.exercise))
-    }
+/// Returns the thresholds of an exercise; the usual ones without an exercise.
+pub(crate) fn usual_thresholds(chosen: Option<&ChosenExercise>) -> MeasureOptions {
+    chosen.map_or_else(MeasureOptions::default, |chosen| thresholds(&chosen.exercise))
+}
 
-    /// Compiles the scene that the arguments name, with the exercise's changes if there is one. Returns it with the limits in force.
-    ///
-    /// # Errors
-    /// Refuses what [`compile_with`] refuses; a refusal of the exercise's changes names the exercise.
-    pub(crate) fn compile(chosen: Option<&Self>, scene: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
-        let Some(chosen) = chosen else { return compile_with(scene, &[]) };
-        let of_exercise = |failure: Failure| match failure {
-            Failure::Refused(message) if message.contains("inclusion") => {
-                Failure::Refused(format!("exercise {}: {message}", chosen.exercise.name))
-            }
-            other => other,
-        };
-        let compiled = compile_with(scene, &chosen.assignments()).map_err(of_exercise)?;
-        chosen.warn_of_scene(&compiled.0.scene.name);
-        Ok(compiled)
-    }
-
-    /// Warns if the exercise is made for other scenes than this one.
-    pub(crate) fn warn_of_scene(&self, scene: &str) {
-        if !self.exercise.scenes.iter().any(|name| name == scene) {
-            let (name, made_for) = (&self.exercise.name, self.exercise.scenes.join(", "));
-            say!("palpate: warning: exercise {name}: made for {made_for}; on `{scene}` its places may be wrong");
+/// Compiles the scene that the arguments name, with the exercise's changes if there is one. Returns it with the limits in force.
+///
+/// # Errors
+/// Refuses what [`compile_with`] refuses; a refusal of the exercise's changes names the exercise.
+pub(crate) fn compile(
+    chosen: Option<&ChosenExercise>,
+    scene: &SceneArguments,
+) -> Result<(Arc<Model>, Limits), Failure> {
+    let Some(chosen) = chosen else { return compile_with(scene, &[]) };
+    let of_exercise = |failure: Failure| match failure {
+        Failure::Refused(message) if message.contains("inclusion") => {
+            Failure::Refused(format!("exercise {}: {message}", chosen.exercise.name))
         }
+        other => other,
+    };
+    let compiled = compile_with(scene, &chosen.assignments()).map_err(of_exercise)?;
+    warn_of_scene(chosen, &compiled.0.scene.name);
+    Ok(compiled)
+}
+
+/// Warns if the exercise is made for other scenes than this one.
+pub(crate) fn warn_of_scene(chosen: &ChosenExercise, scene: &str) {
+    if !chosen.exercise.scenes.iter().any(|name| name == scene) {
+        let (name, made_for) = (&chosen.exercise.name, chosen.exercise.scenes.join(", "));
+        say!("palpate: warning: exercise {name}: made for {made_for}; on `{scene}` its places may be wrong");
     }
 }
 
@@ -135,9 +146,8 @@ pub(crate) struct ScoredExercise {
 }
 
 impl ScoredExercise {
-    /// Returns the exercise of a session at its end, by all figures of it.
-    pub(crate) fn of(judge: &ExerciseJudge, seed: u64, session: &Session, figures: &[Figure]) -> Self {
-        let score = judge.score(figures);
+    /// Returns the exercise of a session at its end, with its score.
+    pub(crate) fn of(judge: &ExerciseJudge, seed: u64, session: &Session, score: Option<&ExerciseScore>) -> Self {
         let criterion = |EarnedCriterion { criterion, value, part }: &EarnedCriterion| ScoredCriterion {
             measure: criterion.measure.clone(),
             weight: criterion.weight,
@@ -160,8 +170,11 @@ impl ScoredExercise {
         ScoredExercise {
             name: judge.exercise().name.clone(),
             seed,
-            score_percent: score.as_ref().map(|score| score.percent),
-            criteria: score.iter().flat_map(|ExerciseScore { criteria, .. }| criteria.iter().map(criterion)).collect(),
+            score_percent: score.map(|score| score.percent),
+            criteria: score
+                .into_iter()
+                .flat_map(|ExerciseScore { criteria, .. }| criteria.iter().map(criterion))
+                .collect(),
             lumps: judge.lumps().iter().map(lump).collect(),
             answers: session.marks().iter().map(answer).collect(),
         }

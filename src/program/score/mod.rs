@@ -15,13 +15,13 @@ use palpate_refusal::printable::{printable, printable_json};
 use serde::{Deserialize, Serialize};
 
 use palpate_session::Session;
-use palpate_session::exercise_judge::ExerciseJudge;
-use palpate_session::measure_recorder::MeasureRecorder;
+use palpate_session::chosen_exercise::ChosenExercise;
+use palpate_session::measured_run::MeasuredRun;
 use palpate_tissue::Model;
 use palpate_tissue::scene::script::Script;
 
 use super::{Failure, write_file};
-use exercise::{ChosenExercise, ScoredExercise};
+use exercise::ScoredExercise;
 
 /// Thresholds of measures, and the hands.
 #[derive(clap::Args)]
@@ -169,72 +169,57 @@ pub(crate) struct Score {
 
 /// Measures a session, and judges it by an exercise if there is one.
 pub(crate) struct ScoreRecorder {
-    recorder: MeasureRecorder,
-    judge: Option<(ExerciseJudge, u64)>,
+    run: MeasuredRun,
+    seed: u64,
     /// What the end of the session has shown.
-    judged: Option<(Vec<Figure>, ScoredExercise)>,
+    judged: Option<ScoredExercise>,
 }
 
 impl ScoreRecorder {
-    /// Begins at step `begin_step`; `continuous` is as for [`MeasureRecorder::new`].
+    /// Begins at step `begin_step`; `continuous` is as for [`MeasuredRun::new`], and `ends_at` as for [`MeasuredRun::ending_at`].
     ///
     /// # Errors
-    /// Refuses what [`MeasureRecorder::new`] and [`ExerciseJudge::new`] refuse.
+    /// Refuses what [`MeasuredRun::new`] refuses.
     pub(crate) fn new(
         model: &Model,
         begin_step: u64,
         options: MeasureOptions,
         continuous: Option<&Script>,
-        chosen: Option<&ChosenExercise>,
+        (chosen, ends_at): (Option<&ChosenExercise>, Option<u64>),
     ) -> Result<Self, Refusal> {
-        let judge = |chosen: &ChosenExercise| {
-            let judge = ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), model, begin_step)?;
-            Ok::<_, Refusal>((judge, chosen.seed))
-        };
-        Ok(ScoreRecorder {
-            recorder: MeasureRecorder::new(model, begin_step, options, continuous)?,
-            judge: chosen.map(judge).transpose()?,
-            judged: None,
-        })
+        let run = MeasuredRun::new(model, begin_step, options, continuous, chosen)?.ending_at(ends_at);
+        Ok(ScoreRecorder { run, seed: chosen.map_or(0, |chosen| chosen.seed), judged: None })
     }
 
-    /// Takes the session at its present step. When the time of the exercise is up, judges it; what comes later does not count.
+    /// Takes the session at its present step. When the exercise ends, judges it; what comes later does not count.
     pub(crate) fn see(&mut self, session: &Session) {
-        if self.judged.is_some() {
-            return;
-        }
-        self.recorder.see(session);
-        if let Some((judge, _)) = &mut self.judge {
-            judge.see(session, self.recorder.rows());
-            if judge.is_time_up(session) {
-                self.finish(session);
-            }
+        if self.run.see(session) {
+            self.finish(session);
         }
     }
 
     /// Judges the session at its end.
     pub(crate) fn finish(&mut self, session: &Session) {
-        if let (Some((judge, seed)), None) = (&self.judge, &self.judged) {
-            let of_truth = judge.figures(session);
-            let mut figures = self.recorder.measures().figures();
-            figures.extend(&of_truth);
-            self.judged = Some((of_truth, ScoredExercise::of(judge, *seed, session, &figures)));
+        if self.judged.is_none() {
+            let ended = self.run.end(session);
+            let score = ended.figures().score;
+            self.judged = ended.judge().map(|judge| ScoredExercise::of(judge, self.seed, session, score.as_ref()));
         }
     }
 
     /// Returns the score and the measures.
     pub(crate) fn into_score(self, source: ScoreSource, rate_hz: f64) -> (Score, Measures) {
-        let measures = self.recorder.into_measures();
-        let (of_truth, exercise) = self.judged.unzip();
-        let score = Score::of(source, rate_hz, &measures, &of_truth.unwrap_or_default());
-        (Score { exercise, ..score }, measures)
+        let measures = self.run.measures();
+        let figures = self.run.ended().map_or_else(|| measures.figures(), |ended| ended.figures().figures);
+        let score = Score::of(source, rate_hz, measures, &figures);
+        (Score { exercise: self.judged, ..score }, measures.clone())
     }
 }
 
 impl Score {
-    /// Returns the score of what was measured at `rate_hz` steps per second, with the figures that need the truth of an exercise.
+    /// Returns the score of what was measured at `rate_hz` steps per second, with all figures.
     #[allow(clippy::cast_precision_loss)]
-    fn of(source: ScoreSource, rate_hz: f64, measures: &Measures, of_truth: &[Figure]) -> Self {
+    fn of(source: ScoreSource, rate_hz: f64, measures: &Measures, figures: &[Figure]) -> Self {
         let measure = |Figure { definition, value, tool }: Figure| ScoredMeasure {
             name: definition.name.to_owned(),
             value,
@@ -257,7 +242,7 @@ impl Score {
             begin_step: measures.begin_step(),
             steps: measures.steps(),
             thresholds: Thresholds { force_limit_n, coverage_pa, press_n, hands, seen_along },
-            measures: measures.figures().into_iter().chain(of_truth.iter().copied()).map(measure).collect(),
+            measures: figures.iter().copied().map(measure).collect(),
             limit_crossing_count: force_limit_n.map(|_| timeline.crossing_count()),
             limit_crossings: timeline.crossings().iter().map(crossing).collect(),
             exercise: None,

@@ -278,6 +278,7 @@ impl Fleet {
             // They arrive with the commands that wait.
             waiting: Vec::new(),
             frozen: true,
+            exercise: None,
             recorded: true,
         };
         let (owner, pacer) = (self.account(&resumed.header.owner), self.pacer.clone());

@@ -37,7 +37,7 @@ pub(super) async fn offer(
     request: &pb::OpenDatagramsRequest,
     account: &Account,
 ) -> Result<pb::DatagramOffer> {
-    let handle = services.session(&request.session_id).await?;
+    let handle = services.seat("OpenDatagrams", &request.session_id).await?.handle;
     let lease = lease_id(&request.lease_id)?;
     let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
     let (tools, step) = handle.at_intake(|intake, now| {
@@ -58,7 +58,7 @@ pub(super) async fn offer(
     let cut = guard.cut().clone();
     let samples = handle.samples(sampling, Some(account));
     let notices = Notices::new(tools, step);
-    let instruments = services.instruments.join(&request.session_id, instruments, false);
+    let instruments = services.instruments.join(&handle.id, instruments, false);
     let responses = ResponseStream::new(None, heard, samples, notices, guard, channel.clone(), instruments);
     let session = LeaseSession { controller, responses, channel, arrival: Some(arrival), events };
     let serving = async move {

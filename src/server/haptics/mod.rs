@@ -77,7 +77,7 @@ impl HapticService for Haptics {
         let (peer, tenure) =
             (request.extensions().get::<Peer>().cloned(), request.extensions().get::<Tenure>().cloned());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("AcquireTool", &request.session_id).await?.handle;
         let mut lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
         if may_vanish && !request.outlives_connection {
             lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
@@ -110,7 +110,7 @@ impl HapticService for Haptics {
         request: Request<pb::ReleaseToolRequest>,
     ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("ReleaseTool", &request.session_id).await?.handle;
         let lease = lease_id(&request.lease_id)?;
         handle.at_intake(|intake, _| intake.release(lease))?;
         Ok(Response::new(pb::ReleaseToolResponse {}))
@@ -122,7 +122,7 @@ impl HapticService for Haptics {
     ) -> Result<Response<pb::SendCommandsResponse>, Status> {
         let now = now_ns();
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("SendCommands", &request.session_id).await?.handle;
         let lease = lease_id(&request.lease_id)?;
         let shape = handle.model.shape();
         let read = |(index, command): (usize, &pb::Command)| {
@@ -157,7 +157,7 @@ impl HapticService for Haptics {
     ) -> Result<Response<Self::WatchSamplesStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("WatchSamples", &request.session_id).await?.handle;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
         let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
         let guard = handle.open_stream("WatchSamples", StreamKind::ReadsOnly, &account)?;
@@ -179,7 +179,7 @@ impl HapticService for Haptics {
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let handle = self.0.session(&request.session_id).await?;
+        let handle = self.0.seat("Probe", &request.session_id).await?.handle;
         let every = wire::every("every_steps", request.every_steps)?;
         let points = match wire::from_probed(request.r#where.as_ref())? {
             Some((field, names)) => Some(self.probed(field, handle.model.shape(), names)?),

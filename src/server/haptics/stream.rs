@@ -111,7 +111,8 @@ impl KeepaliveTimer {
 
 /// Handles the first message of a haptic stream: checks it, computes the first law and acquires the tools.
 async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
-    let handle = services.session(&open.session_id).await?;
+    let seat = services.seat("Touch", &open.session_id).await?;
+    let handle = seat.handle.clone();
     let device = open.device.as_ref().map(touch::from_device).transpose()?;
     let tip = touch::from_tip("tip", open.tip.as_ref())?;
     // A stream that neither renders nor declares a tip may push with forces on any tissue.
@@ -131,7 +132,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
     let guard = handle.open_stream("Touch", kind, account)?;
     let begun = match device {
-        Some(_) => Some(Computing::begin(&services.job_pool, account, &handle, tip).await?),
+        Some(_) => Some(Computing::begin(&services.job_pool, account, &seat, tip).await?),
         None => None,
     };
     let (law, computing) = begun.unzip();
@@ -202,7 +203,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let samples = handle.samples(sampling, open.tools.is_empty().then_some(account));
     info!(session = %handle.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
     let notices = Notices::new(open.tools.clone(), step);
-    let instruments = services.instruments.join(&open.session_id, instruments, open.other_tools);
+    let instruments = services.instruments.join(&handle.id, instruments, open.other_tools);
     Ok((Opened { answer, updates, samples, notices, guard, channel, instruments }, held))
 }
 

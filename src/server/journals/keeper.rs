@@ -258,7 +258,7 @@ impl Keeper {
 
     /// Starts the journal of a session, at the beginning of its event log or where that started again.
     fn begin(&mut self, event_log: &Arc<EventLog>, anew: Option<Beginning>) {
-        let About { id, owner, idle_timeout_s, first, begin_step, running, until_step, after_run, revision } =
+        let About { id, owner, idle_timeout_s, first, begin_step, running, until_step, after_run, revision, exercise } =
             &event_log.about;
         let first_of = Beginning { step: *begin_step, running: *running, until_step: *until_step };
         let Beginning { step: begin_step, running, until_step } = anew.unwrap_or(first_of);
@@ -274,6 +274,7 @@ impl Keeper {
             running,
             until_step,
             ownership_revision: *revision,
+            exercise: exercise.clone(),
         };
         let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
         let writer = JournalWriter::new(&opening, unix_ns()).signed(self.key.as_ref());

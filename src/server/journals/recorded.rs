@@ -331,6 +331,7 @@ impl Recorded {
             revision,
             waiting: Vec::new(),
             frozen: false,
+            exercise: None,
             // A session started from a journal of this server may be recorded as well.
             recorded: self.with_meshes || moment.upload_id.is_empty() || !has_mesh,
         };
@@ -449,6 +450,7 @@ pub(in crate::server) fn snapshot(handle: &SessionHandle, present: &Present) -> 
         running: *running,
         until_step: *until_step,
         ownership_revision: handle.revision(),
+        exercise: None,
     };
     let now = unix_ns();
     let mut writer = JournalWriter::new(&opening, now);

@@ -3,14 +3,16 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 
 use super::keeper::FolderContent;
-use palpate_realtime::{Begin, Pacer};
+use palpate_realtime::{Begin, EndedExercise, Pacer, SessionExercise};
 use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::journal::file::JournalFile;
-use palpate_session::journal::{self, JournalReader, Replay, Survey, pb};
+use palpate_session::journal::{self, JournalReader, Replay, Resumed, Survey, pb};
+use palpate_session::measured_run::MomentFigures;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::scheme_selection::NEVER;
@@ -144,6 +146,20 @@ fn one<'f>(
     (ResumeOutcome::Ended, newest)
 }
 
+/// Returns the exercise of a session that continues. One that had not ended begins again.
+fn exercise(
+    chosen: ChosenExercise,
+    resumed: &Resumed,
+    ended: Option<&pb::ExerciseResult>,
+    pacer: &Pacer,
+) -> Result<SessionExercise> {
+    let plain = pacer.plain_of(&chosen, &resumed.first, &NEVER)?;
+    let trainee_id = resumed.header.exercise.as_ref().map(|exercise| exercise.trainee_id.clone()).unwrap_or_default();
+    let figures = ended.map(|result| Arc::new(MomentFigures::recorded(result)));
+    let ended = figures.map(|figures| EndedExercise { figures, answers: Vec::new() });
+    Ok(SessionExercise { chosen, trainee_id, plain, ended })
+}
+
 fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<ResumeOutcome> {
     let mut reader = JournalReader::open(&file.path)?;
     let survey = reader.survey(&mut |_| {})?;
@@ -151,6 +167,8 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
         return Ok(ResumeOutcome::Ended);
     }
     let until_step = survey.until_step;
+    let chosen = ChosenExercise::from_header(reader.place(), reader.header())?;
+    let ended = if chosen.is_some() { reader.exercise_result()? } else { None };
     let mut resumed = Replay::near(reader, survey, limits, until_step)?.resume()?;
     let begin = Begin {
         id: file.session_id.clone(),
@@ -164,6 +182,7 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
         waiting: std::mem::take(&mut resumed.waiting),
         frozen: false,
         recorded: true,
+        exercise: chosen.map(|chosen| exercise(chosen, &resumed, ended.as_ref(), pacer)).transpose()?,
     };
     let owner = pacer.budget.account(&resumed.header.owner);
     let (step, torn_bytes) = (resumed.session.step_count(), resumed.survey.torn_bytes);

@@ -504,6 +504,24 @@ impl<'s> JournalReader<'s> {
         Ok(survey)
     }
 
+    /// Reads the file once from the beginning, and moves to the first batch again. Returns the result of the session's exercise; `None` if
+    /// it has not ended in this journal.
+    ///
+    /// # Errors
+    /// Returns the refusals of [`JournalReader::next_batch`], and refuses inputs that can't be decoded.
+    pub fn exercise_result(&mut self) -> Result<Option<pb::ExerciseResult>> {
+        self.rewind();
+        let mut found = None;
+        while let (None, Some(batch)) = (&found, self.next_batch()?) {
+            found = batch.inputs()?.into_iter().find_map(|input| match input.what {
+                Some(pb::input::What::ExerciseResult(result)) => Some(result),
+                _ => None,
+            });
+        }
+        self.rewind();
+        Ok(found)
+    }
+
     /// Returns the next batch; `None` after the last whole one, also if bytes of a torn batch follow.
     ///
     /// # Errors

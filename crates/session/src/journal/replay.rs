@@ -686,6 +686,7 @@ pub struct Verdict {
 ///     running: true,
 ///     until_step: None,
 ///     ownership_revision: 0,
+///     exercise: None,
 /// };
 /// // Times are in nanoseconds since 1970; a step is a millisecond.
 /// let mut writer = JournalWriter::new(&opening, 0);

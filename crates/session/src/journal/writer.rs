@@ -32,6 +32,8 @@ pub struct Opening<'a> {
     pub until_step: Option<u64>,
     /// Revision in etcd at which the server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
+    /// The exercise that the session is made for ([`ChosenExercise::recorded`](crate::chosen_exercise::ChosenExercise::recorded)).
+    pub exercise: Option<pb::RecordedExercise>,
 }
 
 impl Opening<'_> {
@@ -53,6 +55,7 @@ impl Opening<'_> {
             appearance: Some(appearance),
             tissue: Some(message::tissue(self.first)),
             ownership_revision: self.ownership_revision,
+            exercise: self.exercise.clone(),
         }
     }
 }

@@ -54,6 +54,23 @@ pub struct Exercise {
     pub limits: ExerciseLimits,
     /// How the measures become a score.
     pub criteria: Vec<Criterion>,
+    /// What the trainee is told.
+    pub trainee: TraineeView,
+}
+
+/// What a trainee is told of their measures.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TraineeView {
+    /// Names of the measures that they see while the exercise goes on, none of which needs the truth; `None`: all of these.
+    pub live_measures: Option<Vec<String>>,
+    /// Whether they see the result, with the truth.
+    pub sees_result: bool,
+}
+
+impl Default for TraineeView {
+    fn default() -> Self {
+        TraineeView { live_measures: None, sees_result: true }
+    }
 }
 
 /// Lumps that are drawn from a seed. Ranges are [least, most], both included.
@@ -183,6 +200,11 @@ impl Exercise {
     /// Returns the lumps of a seed; empty without hidden lumps. The reader has checked that the exercise's own seed has some.
     pub fn lumps(&self, seed: u64) -> Option<Vec<Lump>> {
         self.lumps.as_ref().map_or(Some(Vec::new()), |hidden| hidden.drawn(seed))
+    }
+
+    /// Returns whether the exercise hides something from the trainee: how many lumps there are, and where.
+    pub fn hides_truth(&self) -> bool {
+        self.lumps.is_some()
     }
 
     /// Returns the assignments by which a scene is changed ([`Document::set`](super::toml_document::Document::set)): those of the exercise,

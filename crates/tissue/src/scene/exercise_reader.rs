@@ -5,6 +5,7 @@ use glam::DVec3;
 use super::collection::{Collection, is_name, name_in};
 use super::exercise::{
     AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, HiddenLumps, LiftTask, MAX_PARTS,
+    TraineeView,
 };
 use super::kind::TextKind;
 use super::toml_document::{Document, Fields, Item};
@@ -16,20 +17,19 @@ use std::path::Path;
 /// Folder of the exercises that a user of the programs can give by name.
 pub const EXERCISES: &str = "exercises";
 
-/// Reads the exercise that a user gave: the path of a file, or the name of one in ./exercises or of a built-in one. A plain word that
-/// is not a file of the working directory is a name.
+/// Returns the exercise that a user gave, as the name that refusals use for it and its text: the path of a file, or the name of one in
+/// ./exercises or of a built-in one. A plain word that is not a file of the working directory is a name.
 ///
 /// # Errors
-/// Refuses an unknown name, a file that can't be read, and every text that [`Exercise::parse`] refuses.
-pub fn find_exercise(path: &Path, limits: &Limits) -> Result<Exercise> {
-    let (name, text) = match name_in(path) {
+/// Refuses an unknown name and a file that can't be read. The text is not checked ([`Exercise::parse`]).
+pub fn find_exercise(path: &Path, limits: &Limits) -> Result<(String, String)> {
+    match name_in(path) {
         Some(name) => {
             let scenes = Collection::new(TextKind::Scene, Path::new("scenes"));
-            Collection::new(TextKind::Exercise, Path::new(EXERCISES)).for_user().text(name, &scenes, limits)?
+            Collection::new(TextKind::Exercise, Path::new(EXERCISES)).for_user().text(name, &scenes, limits)
         }
-        None => (path.display().to_string(), files::read_text(path, limits.file_bytes)?),
-    };
-    Exercise::parse(&name, &text)
+        None => Ok((path.display().to_string(), files::read_text(path, limits.file_bytes)?)),
+    }
 }
 
 impl Exercise {
@@ -67,6 +67,7 @@ fn read(fields: &mut Fields<'_>) -> Result<Exercise> {
         coverage: fields.item("coverage").map(|item| item.table(coverage)).transpose()?,
         limits: fields.item("limits").map_or(Ok(ExerciseLimits::default()), |item| item.table(limits))?,
         criteria: criteria(fields)?,
+        trainee: fields.item("trainee").map_or(Ok(TraineeView::default()), |item| item.table(trainee))?,
     };
     if exercise.lumps(exercise.seed).is_none() {
         let message = "have no room in the box from `from_m` to `to_m`: make it larger, or the lumps fewer, smaller or less apart";
@@ -206,6 +207,14 @@ fn coverage(fields: &mut Fields<'_>) -> Result<CoverageTask> {
 
 fn limits(fields: &mut Fields<'_>) -> Result<ExerciseLimits> {
     Ok(ExerciseLimits { force_n: positive_or_none(fields, "force_n")? })
+}
+
+fn trainee(fields: &mut Fields<'_>) -> Result<TraineeView> {
+    let names = |item: Item<'_>| item.list()?.iter().map(Item::text).collect::<Result<Vec<_>>>();
+    Ok(TraineeView {
+        live_measures: fields.item("live_measures").map(names).transpose()?,
+        sees_result: fields.item("sees_result").map_or(Ok(true), |item| item.flag())?,
+    })
 }
 
 fn criteria(fields: &mut Fields<'_>) -> Result<Vec<Criterion>> {

@@ -314,6 +314,26 @@ impl Scene {
         Some(Scene { body, springs, damping_n_s_per_m, ..self.clone() })
     }
 
+    /// Returns the scene of the same tissue without its inclusions.
+    ///
+    /// # Errors
+    /// Refuses a mesh that does not enclose its volume any more, which no scene has that was read.
+    pub fn without_inclusions(&self) -> Result<Self> {
+        let substance = Substance {
+            body: self.body.clone(),
+            material: None,
+            inclusions: Arc::default(),
+            springs: self.springs.clone(),
+            anchor_stiffness_n_per_m: self.anchor_stiffness_n_per_m,
+            damping_n_s_per_m: self.damping_n_s_per_m,
+            volume_stiffness_pa: self.volume_stiffness_pa,
+        };
+        let bare = substance.with(Vec::new(), "inclusion")?;
+        let encloses = self.volume_stiffness_pa > 0.0;
+        let Substance { body, .. } = if encloses { bare.enclosing(self.volume_stiffness_pa)? } else { bare };
+        Ok(Scene { body, inclusions: Arc::default(), ..self.clone() })
+    }
+
     /// Reads a scene file and applies the `--set` assignments (`key.path=value`), in their order, which
     /// override its keys. The path may be a pipe. Paths of other files start from the file's folder; limits
     /// bound what is read.

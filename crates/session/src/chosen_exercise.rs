@@ -1,0 +1,74 @@
+//! An exercise with the hidden truth that was drawn for a session, and how a journal keeps both.
+
+use std::sync::Arc;
+
+use palpate_proto::journal as pb;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::scene::exercise::{Exercise, Lump};
+
+/// An exercise and its hidden truth.
+#[derive(Debug, Clone)]
+pub struct ChosenExercise {
+    /// The exercise.
+    pub exercise: Exercise,
+    /// Its text, TOML.
+    pub text: Arc<str>,
+    /// The seed from which the truth is drawn.
+    pub seed: u64,
+    /// The lumps that are hidden.
+    pub lumps: Vec<Lump>,
+}
+
+impl ChosenExercise {
+    /// Reads an exercise from TOML text, which refusals call `name`, and draws its truth from `seed`, or from the exercise's own if there
+    /// is none.
+    ///
+    /// # Errors
+    /// Refuses what [`Exercise::parse`] refuses, and a seed for whose lumps the exercise has no room, with the field `seed`.
+    pub fn new(name: &str, text: &str, seed: Option<u64>) -> Result<Self> {
+        let exercise = Exercise::parse(name, text)?;
+        let seed = seed.unwrap_or(exercise.seed);
+        let lumps = exercise.lumps(seed).ok_or_else(|| {
+            let message = format!("{seed}: the lumps of this seed have no room in their box; take another seed");
+            Refusal::new(Reason::OutOfRange, "seed", message)
+        })?;
+        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps })
+    }
+
+    /// Returns the assignments by which a scene gets the hidden lumps.
+    pub fn assignments(&self) -> Vec<String> {
+        self.exercise.assignments(&self.lumps)
+    }
+
+    /// Returns the exercise as the header of a journal has it; `trainee_id` is the ID that opens the session for a trainee.
+    pub fn recorded(&self, trainee_id: &str) -> pb::RecordedExercise {
+        pb::RecordedExercise { text: self.text.to_string(), seed: self.seed, trainee_id: trainee_id.to_owned() }
+    }
+
+    /// Returns the exercise in the header of a journal; `None` if the session was not made for one. `place` names the journal.
+    ///
+    /// # Errors
+    /// Refuses a text or a seed that [`ChosenExercise::new`] refuses.
+    pub fn from_header(place: &str, header: &pb::Header) -> Result<Option<Self>> {
+        let read = |recorded: &pb::RecordedExercise| {
+            let read = ChosenExercise::new("exercise", &recorded.text, Some(recorded.seed));
+            read.map_err(|refusal| Refusal { place: Some(place.to_owned()), ..refusal.within("exercise") })
+        };
+        header.exercise.as_ref().map(read).transpose()
+    }
+
+    /// Refuses an exercise or a seed that another one contradicts, which is that of the journal `place`.
+    ///
+    /// # Errors
+    /// Refuses another text, with the field `exercise`, and another seed, with the field `seed`.
+    pub fn check_same(&self, recorded: &ChosenExercise, place: &str) -> Result<()> {
+        let (what, field) = match (self.text == recorded.text, self.seed == recorded.seed) {
+            (true, true) => return Ok(()),
+            (false, _) => (format!("exercise `{}`", recorded.exercise.name), "exercise"),
+            (true, false) => (format!("seed {}", recorded.seed), "seed"),
+        };
+        let given = if field == "seed" { self.seed.to_string() } else { self.exercise.name.clone() };
+        let message = format!("{given}: the session was made for the {what}, which its journal has; leave this out");
+        Err(Refusal { place: Some(place.to_owned()), ..Refusal::new(Reason::OutOfRange, field, message) })
+    }
+}
