@@ -64,8 +64,8 @@ enum ServerCommand {
         palpate mesh liver.obj --unit mm\n  \
         palpate mesh scan.stl --unit mm --repair --vertices 5000 --output liver.obj\n  \
         palpate mesh organ.msh --unit 0.0254 --json\n\n\
-        Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume \
-        mesh gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one \
+        Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh), VTK (.vtk, .vtp and .vtu), MEDIT (.mesh \
+        and .meshb), TetGen (.node and .ele) and Abaqus (.inp). A volume mesh gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one \
         unit. Places in the report are in that unit.\n\n\
         As for a scene, vertices at one position are joined along the edges of their triangles, closed surfaces are \
         turned outward, and duplicate triangles are removed; the report lists these changes. Vertices are numbered \

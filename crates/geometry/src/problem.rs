@@ -192,7 +192,8 @@ impl fmt::Display for Problem {
             ),
             Problem::UnknownFormat => write!(
                 f,
-                "the format is not known: give a file that ends in .obj, .stl, .ply, .gltf, .glb, .msh, .vtk, .vtp or .vtu"
+                "the format is not known: give a file that ends in .obj, .stl, .ply, .gltf, .glb, .msh, .vtk, .vtp, .vtu, .mesh, \
+                 .meshb, .node, .ele or .inp"
             ),
             Problem::Syntax { message } | Problem::Unsupported { message } => f.write_str(message),
             Problem::Truncated { missing } => {

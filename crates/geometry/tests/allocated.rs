@@ -193,6 +193,26 @@ fn files_that_say_much_in_few_bytes_take_no_more_than_a_multiple_of_them() {
         ("strips.vtk", cells("9 0 1 2 3 4 5 6 7 0\n", "6\n", 30_000, 10)),
         ("polygon.vtk", cells(&format!("40000{}\n", " 1 2".repeat(20_000)), "7\n", 4, 40_001)),
         ("nodes.msh", nodes(40_000)),
+        ("nodes.inp", {
+            let nodes: String = (0..40_000).map(|node| format!("{node}\n")).collect();
+            lines(&format!("*NODE\n{nodes}*ELEMENT,TYPE=C3D4,ELSET=a\n"), "1,0,1,2,3\n", 40_000)
+        }),
+        ("curved.inp", {
+            let nodes = "1\n2,1,0,0\n3,0,1,0\n4,0,0,1\n5,.5,0,0\n6,.5,.5\n7,0,.5\n8,0,0,.5\n9,.5,0,.5\n10,0,.5,.5\n";
+            lines(&format!("*NODE\n{nodes}*ELEMENT,TYPE=C3D10\n"), "1,1,2,3,4,5,6,7,8,9,10\n", 30_000)
+        }),
+        ("curved-apart.inp", {
+            let element = |n: usize| (0..=10).map(|k| format!("{},", 10 * n + k)).collect::<String>() + "\n";
+            let node = |n: usize| format!("{n},{},{},{}\n", n % 7, n * 31 % 11, n * 17 % 13);
+            let nodes: String = (0..40_000).map(node).collect();
+            (format!("*NODE\n{nodes}*ELEMENT,TYPE=C3D10,ELSET=a\n") + &(0..3_990).map(element).collect::<String>())
+                .into_bytes()
+        }),
+        ("tetrahedra.mesh", {
+            let vertices = "0 0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n";
+            let head = format!("MeshVersionFormatted 1\nDimension 3\nVertices 4\n{vertices}Tetrahedra 60000\n");
+            [lines(&head, "1 2 3 4 1\n", 60_000), b"End".to_vec()].concat()
+        }),
         ("zeros.vtp", vtp(&zeros, "")),
         ("more.vtp", vtp(&packed(4, 1 << 20, 1 << 10), "")),
         ("promised.vtp", vtp(&packed(1, 1 << 10, u32::MAX as usize), "")),

@@ -22,6 +22,9 @@ const CORPUS: usize = 256;
 /// Longest input, bytes.
 const LONGEST: usize = 1 << 14;
 
+/// Parts the two files of TetGen in an input.
+const FORM_FEED: u8 = 0x0c;
+
 /// Maximum memory for a run of all readers, bytes. A single unchecked count would need more.
 const MEMORY: u64 = 512 << 20;
 
@@ -67,6 +70,12 @@ fn pieces() -> Vec<Vec<u8>> {
         "\n$Nodes\n",
         "\n$Elements\n",
         "CELLS 1 1\n",
+        "\n*NODE\n",
+        "\n*ELEMENT, TYPE=C3D4\n",
+        "\n*Part\n",
+        ",",
+        " Tetrahedra 1 ",
+        "\x0c",
         " 65536",
     ];
     let mut pieces: Vec<Vec<u8>> = texts.iter().map(|text| text.as_bytes().to_vec()).collect();
@@ -115,11 +124,14 @@ fn bend(random: &mut Rng, mut bytes: Vec<u8>, other: &[u8], pieces: &[Vec<u8>]) 
 
 /// Reads a file, and applies all operations to the mesh. Returns the number of triangles if the file was accepted.
 fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
-    let neighbour = |_: &str| Some(vec![1; 128]);
+    // The other file of TetGen comes after a form feed.
+    let ends = name.ends_with(".ele").then(|| bytes.iter().position(|byte| *byte == FORM_FEED)).flatten();
+    let (bytes, beside) = ends.map_or((bytes, &[1; 128][..]), |end| (&bytes[..end], &bytes[end + 1..]));
+    let neighbour = |_: &str| Some(beside.to_vec());
     let found = match read(name, bytes, Unit::METRE, &neighbour, &ReadLimits::default()) {
         Ok(found) => found,
         Err(error) => {
-            assert!(error.to_string().starts_with(name));
+            assert!(error.to_string().starts_with(name.trim_end_matches("ele")));
             return None;
         }
     };
@@ -179,6 +191,7 @@ fn fuzz(extensions: &[&str]) {
         .into_iter()
         .map(|sample| (sample.name, sample.bytes))
         .chain(common::solids().into_iter().map(|solid| (solid.name, solid.text.into_bytes())))
+        .chain([0, 1].map(|first| ("both.ele", common::tetgen(first).join("\x0c").into_bytes())))
         .filter(|(name, _)| is_own(name))
         .collect();
     for (name, bytes) in &corpus {
@@ -244,4 +257,19 @@ fn vtk() {
 #[test]
 fn vtk_xml() {
     fuzz(&["vtp", "vtu"]);
+}
+
+#[test]
+fn medit() {
+    fuzz(&["mesh", "meshb"]);
+}
+
+#[test]
+fn tetgen() {
+    fuzz(&["ele"]);
+}
+
+#[test]
+fn abaqus() {
+    fuzz(&["inp"]);
 }

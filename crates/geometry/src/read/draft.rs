@@ -210,12 +210,13 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a volume element by its corners, to groups of vertices and to the regions with the same names; further nodes of curved ones
-    /// are ignored.
+    /// Adds a volume element by its corners, to groups of vertices and to the regions with the same names. The edges of a tetrahedron
+    /// with ten nodes bend at their middles; further nodes of other curved ones are ignored.
     pub(super) fn cell(&mut self, cell: Cell, nodes: &[i64], groups: &[usize]) -> Result<(), Problem> {
         if self.volume.len() >= self.limits.triangles {
             return Err(Problem::TooLarge { what: "volume elements", limit: self.limits.triangles });
         }
+        let all = nodes;
         let Some(nodes) = nodes.get(..cell.corners()) else {
             return Err(Problem::Syntax { message: format!("a volume element of {} vertices", nodes.len()) });
         };
@@ -225,7 +226,17 @@ impl<'l> Draft<'l> {
         for group in groups {
             self.allowance.push(&mut self.cell_groups, (self.volume.len() as u32, *group as u32))?;
         }
-        self.volume.add(cell, &corners, &mut self.allowance)
+        self.volume.add(cell, &corners, &mut self.allowance)?;
+        if let (Cell::Tetrahedron, [_, _, _, _, middles @ ..]) = (cell, all)
+            && middles.len() == 6
+        {
+            let mut own = [0; 6];
+            for (own, middle) in own.iter_mut().zip(middles) {
+                *own = self.index(*middle)?;
+            }
+            self.volume.add_middles(own, &self.vertices, &mut self.allowance)?;
+        }
+        Ok(())
     }
 
     /// Returns whether the triangles so far form a closed surface.

@@ -2,24 +2,16 @@
 //!
 //! No crate is used: only `mshio` reads Gmsh, only format 4.1, and it ends the program on unknown data.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use super::draft::Draft;
+use super::nodes::{ElementKind, NumberedNodes};
 use super::source::{Order, Scalar, Source, named, parsed, shown};
 use super::volume::Cell;
 use crate::{MeshError, Problem};
 
 /// Maximum number of physical tags used per entity.
 const PHYSICAL: usize = 16;
-
-/// The kind of an element, with its corners.
-#[derive(Clone, Copy)]
-enum ElementKind {
-    /// A point or line, which is not part of a surface.
-    Line,
-    Face(usize),
-    Cell(Cell),
-}
 
 /// Returns an element type of Gmsh: the number of its nodes (corners first), its dimension and its kind.
 fn element_type(number: i64) -> Option<(usize, i64, ElementKind)> {
@@ -79,8 +71,7 @@ struct GmshFile<'s, 'd, 'l> {
     order: Option<Order>,
     /// The type of counts and tags in a binary file of format 4.1.
     size: Scalar,
-    /// Vertices by the tags of nodes. Only looked up, so its order does not matter.
-    nodes: HashMap<i64, i64>,
+    nodes: NumberedNodes,
     /// Names by dimension and physical tag.
     names: BTreeMap<(i64, i64), String>,
     /// The physical tags of the entities of format 4.1, by dimension and tag.
@@ -93,7 +84,7 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
         draft,
         order: None,
         size: Scalar::U64,
-        nodes: HashMap::new(),
+        nodes: NumberedNodes::default(),
         names: BTreeMap::new(),
         physical: BTreeMap::new(),
     };
@@ -127,7 +118,9 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
                 let Some(at) = at else { break };
                 file.source.take(at, "the end of a section")?;
             }
-            _ => return Err(file.source.syntax(format!("`{}`: a section such as $Nodes is expected", shown(word)))),
+            _ => {
+                return Err(file.source.syntax(format!("`{}`: a section such as $Nodes is expected", shown(word))));
+            }
         }
     }
     if !has_nodes || !has_elements {
@@ -253,13 +246,7 @@ impl GmshFile<'_, '_, '_> {
     }
 
     fn node(&mut self, tag: i64, at: [f64; 3]) -> Result<(), MeshError> {
-        let number = self.draft.vertices() as i64;
-        // Memory in a growing hash table.
-        self.draft.allowance.take(2 * size_of::<(i64, i64)>() + 2).map_err(|problem| self.source.fail(problem))?;
-        if self.nodes.insert(tag, number).is_some() {
-            return Err(self.source.syntax(format!("node {tag} is there twice")));
-        }
-        self.draft.vertex(at).map_err(|problem| self.source.fail(problem))
+        self.nodes.add(tag, at, self.draft).map_err(|problem| self.source.fail(problem))
     }
 
     /// Reads the nodes of formats 1 and 2.
@@ -322,28 +309,13 @@ impl GmshFile<'_, '_, '_> {
         tags: &mut [i64],
         physical: &[i64],
     ) -> Result<(), MeshError> {
-        for tag in &mut *tags {
-            let vertices = self.draft.vertices();
-            let found = self.nodes.get(tag).copied();
-            *tag = found.ok_or_else(|| self.source.fail(Problem::IndexOutOfRange { index: *tag, vertices }))?;
-        }
+        self.nodes.to_vertices(tags, self.draft).map_err(|problem| self.source.fail(problem))?;
         let mut groups = Vec::new();
         for tag in physical {
             let name = self.names.get(&(dimension, *tag)).cloned().unwrap_or_else(|| format!("physical {tag}"));
             groups.push(self.draft.group(&name).map_err(|problem| self.source.fail(problem))?);
         }
-        let added = match kind {
-            ElementKind::Line => {
-                self.draft.lines += 1;
-                self.draft.assign(tags, &groups)
-            }
-            ElementKind::Face(corners) => {
-                self.draft.drops_unused |= tags.len() > corners;
-                self.draft.polygon(&tags[..corners.min(tags.len())], &[], &groups)
-            }
-            ElementKind::Cell(cell) => self.draft.cell(cell, tags, &groups),
-        };
-        added.map_err(|problem| self.source.fail(problem))
+        self.draft.element(kind, tags, &groups).map_err(|problem| self.source.fail(problem))
     }
 
     fn node_tags(&mut self, count: usize, scalar: Scalar) -> Result<Vec<i64>, MeshError> {

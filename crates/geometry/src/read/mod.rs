@@ -1,14 +1,19 @@
-//! Reads mesh files within limits: OBJ, STL, PLY, glTF, Gmsh and VTK. Never panics, for any bytes.
+//! Reads mesh files within limits: OBJ, STL, PLY, glTF, Gmsh, VTK, MEDIT, TetGen and Abaqus. Never panics, for any
+//! bytes.
 
+mod abaqus;
 mod allowance;
 mod draft;
 mod gltf;
 mod gmsh;
+mod medit;
+mod nodes;
 mod obj;
 mod ply;
 mod polygon;
 mod source;
 mod stl;
+mod tetgen;
 mod volume;
 mod vtk;
 mod vtk_xml;
@@ -62,6 +67,9 @@ enum Format {
     Gmsh,
     Vtk,
     VtkXml,
+    Medit,
+    TetGen,
+    Abaqus,
 }
 
 impl Format {
@@ -80,6 +88,10 @@ impl Format {
             Some(Format::VtkXml)
         } else if starts("$MeshFormat") || starts("$NOD") || starts("$Comments") || starts("$PhysicalNames") {
             Some(Format::Gmsh)
+        } else if starts("MeshVersionFormatted") {
+            Some(Format::Medit)
+        } else if starts("*Heading") || starts("*Node") {
+            Some(Format::Abaqus)
         } else if stl::is_binary(bytes) || starts("solid") {
             Some(Format::Stl)
         } else {
@@ -97,6 +109,9 @@ impl Format {
             "msh" => Some(Format::Gmsh),
             "vtk" => Some(Format::Vtk),
             "vtp" | "vtu" => Some(Format::VtkXml),
+            "mesh" | "meshb" => Some(Format::Medit),
+            "node" | "ele" => Some(Format::TetGen),
+            "inp" => Some(Format::Abaqus),
             _ => None,
         }
     }
@@ -190,6 +205,9 @@ pub fn read_paid(
         Format::Gmsh => gmsh::read(source, &mut draft)?,
         Format::Vtk => vtk::read(source, &mut draft)?,
         Format::VtkXml => vtk_xml::read(name, bytes, &mut draft)?,
+        Format::Medit => medit::read(source, &mut draft)?,
+        Format::TetGen => tetgen::read(name, bytes, neighbours, &mut draft)?,
+        Format::Abaqus => abaqus::read(source, &mut draft)?,
     }
     draft.finish(name, unit)
 }

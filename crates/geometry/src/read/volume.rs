@@ -72,6 +72,8 @@ struct VolumeElement {
 #[derive(Default)]
 pub(super) struct Volume {
     elements: Vec<VolumeElement>,
+    /// The edges of tetrahedra with ten nodes, lower end first, and the node at the middle of each.
+    middles: Vec<([u32; 2], u32)>,
 }
 
 /// The surface around volume elements.
@@ -102,7 +104,44 @@ impl Volume {
         allowance.push(&mut self.elements, VolumeElement { kind, corners: own })
     }
 
-    /// Returns a part of the volume: elements by their numbers.
+    /// Adds the nodes at the middles of the edges of the last element, a tetrahedron. Formats number them differently, so each is
+    /// that of the edge whose middle is nearest; if two are nearest to the same, the edges stay straight.
+    pub(super) fn add_middles(
+        &mut self,
+        middles: [u32; 6],
+        vertices: &[DVec3],
+        allowance: &mut MemoryAllowance<'_>,
+    ) -> Result<(), Problem> {
+        const EDGES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
+        let Some(element) = self.elements.last() else { return Ok(()) };
+        let at = |vertex: u32| vertices[vertex as usize];
+        let edges = EDGES.map(|ends| ends.map(|end| element.corners[end]));
+        let far = |middle: u32, [a, b]: [u32; 2]| (2.0 * at(middle) - at(a) - at(b)).length_squared();
+        let nearest = |middle: u32| (0..6).min_by(|a, b| far(middle, edges[*a]).total_cmp(&far(middle, edges[*b])));
+        let of_edge = middles.map(|middle| nearest(middle).unwrap_or(0));
+        if (0..6).all(|edge| of_edge.contains(&edge)) {
+            for (middle, edge) in middles.into_iter().zip(of_edge) {
+                let [a, b] = edges[edge];
+                allowance.push(&mut self.middles, ([a.min(b), a.max(b)], middle))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the nodes at the middles of edges, sorted by edge; none if not all elements have them, because the faces of
+    /// others would not fit.
+    fn sorted_middles(&self, allowance: &mut MemoryAllowance<'_>) -> Result<Vec<([u32; 2], u32)>, Problem> {
+        if self.middles.len() != 6 * self.elements.len() {
+            return Ok(Vec::new());
+        }
+        allowance.take(size_of_val(&*self.middles))?;
+        let mut sorted = self.middles.clone();
+        sorted.sort_unstable();
+        sorted.dedup_by_key(|(edge, _)| *edge);
+        Ok(sorted)
+    }
+
+    /// Returns a part of the volume: elements by their numbers, with straight edges.
     pub(super) fn part(
         &self,
         numbers: impl Iterator<Item = u32>,
@@ -162,7 +201,9 @@ impl Volume {
         }
         sides.sort_unstable();
         let alone = || sides.chunk_by(|a, b| a.0 == b.0).filter(|same| same.len() == 1);
-        allowance.take(OUTER * alone().count())?;
+        let middles = self.sorted_middles(allowance)?;
+        let pieces = if middles.is_empty() { 1 } else { 4 };
+        allowance.take(pieces * OUTER * alone().count())?;
         let mut outer: Vec<(u32, u8)> = alone().map(|same| (same[0].1, same[0].2)).collect();
         drop(sides);
         outer.sort_unstable();
@@ -177,7 +218,7 @@ impl Volume {
             }
             face
         };
-        let faces = outer.into_iter().map(face).collect();
+        let faces = outer.into_iter().map(face).flat_map(|face| split(face, &middles)).collect();
         let repeated = is_repeated.iter().filter(|is| **is).count();
         // Elements of some types are all numbered the other way round in some files.
         let is_odd = |(turned, element): (&Option<bool>, &VolumeElement)| {
@@ -186,6 +227,20 @@ impl Volume {
         let turned = is_turned.iter().zip(&self.elements).filter(|pair| is_odd(*pair)).count();
         Ok(OuterSurface { faces, repeated, turned })
     }
+}
+
+/// Splits a triangle at the nodes in the middles of its edges into four, if it has them.
+fn split(face: Vec<u32>, middles: &[([u32; 2], u32)]) -> Vec<Vec<u32>> {
+    let middle = |a: u32, b: u32| {
+        let found = middles.binary_search_by_key(&[a.min(b), a.max(b)], |(edge, _)| *edge);
+        found.ok().map(|at| middles[at].1)
+    };
+    if let [a, b, c] = face[..]
+        && let (Some(ab), Some(bc), Some(ca)) = (middle(a, b), middle(b, c), middle(c, a))
+    {
+        return vec![vec![a, ab, ca], vec![ab, b, bc], vec![ca, bc, c], vec![ab, bc, ca]];
+    }
+    vec![face]
 }
 
 /// Returns whether a quadrilateral is to be split along its second diagonal: if it is not flat, so that the choice

@@ -481,10 +481,17 @@ pub fn samples() -> Vec<SampleFile> {
     // The first solid alone is a complete file.
     let mut two = sample("two.stl", stl_of_two());
     two.knows_its_end = false;
+    // Elements follow elements.
+    let mut abaqus = sample("volume.inp", abaqus());
+    abaqus.knows_its_end = false;
     vec![
         obj,
         old,
         two,
+        abaqus,
+        sample("volume.mesh", medit_text()),
+        sample("volume-two.meshb", medit_binary(2)),
+        sample("volume-four.meshb", medit_binary(4)),
         sample("more.stl", stl_with_more()),
         sample("wide.ply", ply_wide()),
         sample("strips.ply", ply_strips(false)),
