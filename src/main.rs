@@ -63,10 +63,13 @@ enum ServerCommand {
     #[command(after_help = "Examples:\n  \
         palpate mesh liver.obj --unit mm\n  \
         palpate mesh scan.stl --unit mm --repair --vertices 5000 --output liver.obj\n  \
-        palpate mesh organ.msh --unit 0.0254 --json\n\n\
+        palpate mesh organ.msh --unit 0.0254 --json\n  \
+        palpate mesh scan.seg.nrrd --label 3 --output liver.obj\n\n\
         Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh), VTK (.vtk, .vtp and .vtu), MEDIT (.mesh \
-        and .meshb), TetGen (.node and .ele) and Abaqus (.inp). A volume mesh gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one \
-        unit. Places in the report are in that unit.\n\n\
+        and .meshb), TetGen (.node and .ele) and Abaqus (.inp). A volume mesh gives its outer surface. Of a label map of \
+        a scan, NRRD (.nrrd), NIfTI (.nii and .nii.gz) or a segmentation of DICOM (.dcm), --label chooses what to read \
+        the surface of. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit. Places in \
+        the report are in that unit.\n\n\
         As for a scene, vertices at one position are joined along the edges of their triangles, closed surfaces are \
         turned outward, and duplicate triangles are removed; the report lists these changes. Vertices are numbered \
         from 0 in the order of the file.\n\n\

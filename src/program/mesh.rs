@@ -8,7 +8,9 @@ use palpate_geometry::decimate::{MIN_VERTICES, decimate};
 use palpate_geometry::repair::{Repair, SurfaceMeasure, repair};
 use palpate_geometry::report::{Finding, LISTED, MeshReport, Spread};
 use palpate_geometry::write::{Format, write};
-use palpate_geometry::{Group, MeshError, ReadLimits, TriangleMesh, Unit, VolumeRegion, prepare, read, report};
+use palpate_geometry::{
+    Group, MeshError, ReadLimits, TriangleMesh, Unit, VolumeRegion, prepare, read, read_label, report,
+};
 use palpate_refusal::printable::{printable, printable_json};
 use palpate_tissue::files;
 use serde::Serialize;
@@ -19,9 +21,12 @@ use super::{Failure, write_file};
 pub(crate) struct MeshArguments {
     /// The mesh file
     file: PathBuf,
-    /// Unit of the file's lengths: m, cm, mm, or the metres of one unit; required
+    /// Unit of the file's lengths: m, cm, mm, or the metres of one unit; required, but with --label mm by default
     #[arg(long, value_name = "UNIT")]
     unit: Option<String>,
+    /// The label of a label map (NRRD, NIfTI, DICOM) whose surface is the mesh; default: its only one
+    #[arg(long, value_name = "N")]
+    label: Option<i64>,
     /// Write the report as JSON
     #[arg(long)]
     json: bool,
@@ -75,7 +80,8 @@ struct ToldRegion {
 /// Checks a mesh; repairs and writes it if requested.
 pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let name = arguments.file.display().to_string();
-    let Some(unit) = &arguments.unit else {
+    let unit = arguments.unit.as_deref().or(arguments.label.and(Some("mm")));
+    let Some(unit) = unit else {
         let message = "no unit: mesh files do not state theirs; give --unit mm, cm, m, or the metres of one unit";
         return Err(Failure::Refused(format!("{name}: {message}")));
     };
@@ -92,7 +98,11 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let bytes = files::read(&arguments.file, limits.bytes as u64)?;
     let folder = arguments.file.parent().unwrap_or(Path::new(""));
     let neighbours = |name: &str| files::read_regular(&folder.join(name), limits.bytes as u64).ok();
-    let found = match read(&name, &bytes, unit, &neighbours, &limits) {
+    let read = match arguments.label {
+        Some(label) => read_label(&name, &bytes, label, unit, &limits),
+        None => read(&name, &bytes, unit, &neighbours, &limits),
+    };
+    let found = match read {
         Ok(found) => found,
         Err(error) => return refuse(arguments, &name, error, unit),
     };

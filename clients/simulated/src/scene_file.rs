@@ -18,6 +18,9 @@ use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
 
+/// Extensions of files whose bytes alone do not tell the mesh of a scene.
+const REWRITTEN: [&str; 8] = ["gltf", "node", "ele", "nrrd", "nhdr", "nii", "gz", "dcm"];
+
 /// The scene of sessions to create: the name of one of the server's scenes, or a scene read from a file with its mesh.
 pub struct SceneFile(SceneOrigin);
 
@@ -41,8 +44,11 @@ impl SceneFile {
         let limits = Limits::default();
         let own = Scene::load(file, &[], &limits)?;
         let said = mesh_file(file, &limits)?;
-        // Files that a textual glTF file refers to are not uploaded; a rewritten mesh contains everything.
-        let whole = |path: &&PathBuf| path.extension().is_none_or(|extension| extension != "gltf");
+        // The other files of a textual glTF file or of TetGen are not uploaded, nor is the label of a scan; a rewritten
+        // mesh contains everything.
+        let whole = |path: &&PathBuf| {
+            path.extension().is_none_or(|extension| !REWRITTEN.iter().any(|own| extension.eq_ignore_ascii_case(own)))
+        };
         let mesh = match said.as_ref().and_then(|said| Some((said.path.as_ref().filter(whole)?, said))) {
             Some((path, said)) => {
                 let bytes = files::read_regular(path, limits.mesh_bytes)?;

@@ -33,6 +33,6 @@ pub mod write;
 pub use mesh::{Group, TriangleMesh, VolumeRegion};
 pub use prepare::{FileMesh, Prepared, prepare};
 pub use problem::{Element, MeshError, Problem};
-pub use read::{ReadLimits, ReadMesh, read, read_paid};
+pub use read::{ReadLimits, ReadMesh, read, read_label, read_paid};
 pub use report::{MeshReport, report};
 pub use unit::Unit;

@@ -193,7 +193,7 @@ impl fmt::Display for Problem {
             Problem::UnknownFormat => write!(
                 f,
                 "the format is not known: give a file that ends in .obj, .stl, .ply, .gltf, .glb, .msh, .vtk, .vtp, .vtu, .mesh, \
-                 .meshb, .node, .ele or .inp"
+                 .meshb, .node, .ele, .inp, .nrrd, .nii, .nii.gz or .dcm"
             ),
             Problem::Syntax { message } | Problem::Unsupported { message } => f.write_str(message),
             Problem::Truncated { missing } => {

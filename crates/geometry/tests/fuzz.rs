@@ -14,7 +14,7 @@ use palpate_geometry::delaunay::flip_to_delaunay;
 use palpate_geometry::repair::{Repair, repair};
 use palpate_geometry::report::report;
 use palpate_geometry::write::{Format, write};
-use palpate_geometry::{ReadLimits, Unit, prepare, read};
+use palpate_geometry::{ReadLimits, Unit, prepare, read, read_label};
 
 /// Number of accepted inputs that are mutated further.
 const CORPUS: usize = 256;
@@ -76,6 +76,9 @@ fn pieces() -> Vec<Vec<u8>> {
         ",",
         " Tetrahedra 1 ",
         "\x0c",
+        "sizes: 1 70000 3",
+        "(1e-300,0,nan)",
+        " none ",
         " 65536",
     ];
     let mut pieces: Vec<Vec<u8>> = texts.iter().map(|text| text.as_bytes().to_vec()).collect();
@@ -128,7 +131,14 @@ fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
     let ends = name.ends_with(".ele").then(|| bytes.iter().position(|byte| *byte == FORM_FEED)).flatten();
     let (bytes, beside) = ends.map_or((bytes, &[1; 128][..]), |end| (&bytes[..end], &bytes[end + 1..]));
     let neighbour = |_: &str| Some(beside.to_vec());
-    let found = match read(name, bytes, Unit::METRE, &neighbour, &ReadLimits::default()) {
+    let is_label_map = [".nrrd", ".nii", ".gz", ".dcm"].iter().any(|end| name.ends_with(end));
+    let limits = ReadLimits::default();
+    let read = if is_label_map {
+        read_label(name, bytes, if name.ends_with("dcm") { 1 } else { 3 }, Unit::METRE, &limits)
+    } else {
+        read(name, bytes, Unit::METRE, &neighbour, &limits)
+    };
+    let found = match read {
         Ok(found) => found,
         Err(error) => {
             assert!(error.to_string().starts_with(name.trim_end_matches("ele")));
@@ -144,6 +154,11 @@ fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
         assert!(
             group.vertices.is_sorted_by(|a, b| a < b) && group.vertices.iter().all(|vertex| (*vertex as usize) < count)
         );
+    }
+    if is_label_map {
+        // It is closed whatever the labels; other formats try what follows on meshes of every kind.
+        assert_eq!(report(&mesh).holes, 0);
+        return Some(count);
     }
     assert!(serde_json::to_string(&report(&mesh)).is_ok());
     let prepared = prepare(mesh.clone());
@@ -192,6 +207,7 @@ fn fuzz(extensions: &[&str]) {
         .map(|sample| (sample.name, sample.bytes))
         .chain(common::solids().into_iter().map(|solid| (solid.name, solid.text.into_bytes())))
         .chain([0, 1].map(|first| ("both.ele", common::tetgen(first).join("\x0c").into_bytes())))
+        .chain(common::tiny_files())
         .filter(|(name, _)| is_own(name))
         .collect();
     for (name, bytes) in &corpus {
@@ -272,4 +288,19 @@ fn tetgen() {
 #[test]
 fn abaqus() {
     fuzz(&["inp"]);
+}
+
+#[test]
+fn nrrd() {
+    fuzz(&["nrrd"]);
+}
+
+#[test]
+fn nifti() {
+    fuzz(&["nii", "gz"]);
+}
+
+#[test]
+fn dicom() {
+    fuzz(&["dcm"]);
 }

@@ -26,6 +26,11 @@ impl<'a> MemoryAllowance<'a> {
         self.most = self.most.saturating_add(bytes.saturating_mul(MULTIPLE));
     }
 
+    /// Increases the allowance by this many bytes, whatever the length of the file. The caller bounds them.
+    pub(super) fn add_room(&mut self, bytes: usize) {
+        self.most = self.most.saturating_add(bytes);
+    }
+
     /// Takes memory. Refuses above the allowance, or if it is not paid.
     pub(super) fn take(&mut self, bytes: usize) -> Result<(), Problem> {
         let sum = self.taken.saturating_add(bytes);

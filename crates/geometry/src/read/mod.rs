@@ -1,20 +1,26 @@
-//! Reads mesh files within limits: OBJ, STL, PLY, glTF, Gmsh, VTK, MEDIT, TetGen and Abaqus. Never panics, for any
-//! bytes.
+//! Reads mesh files within limits: OBJ, STL, PLY, glTF, Gmsh, VTK, MEDIT, TetGen and Abaqus; and the
+//! labels of NRRD, NIfTI and DICOM. Never panics, for any bytes.
 
 mod abaqus;
 mod allowance;
+mod dicom;
 mod draft;
 mod gltf;
 mod gmsh;
+mod label_map;
 mod medit;
+mod nifti;
 mod nodes;
+mod nrrd;
 mod obj;
 mod ply;
 mod polygon;
+mod smooth_surface;
 mod source;
 mod stl;
 mod tetgen;
 mod volume;
+mod voxels;
 mod vtk;
 mod vtk_xml;
 
@@ -70,6 +76,9 @@ enum Format {
     Medit,
     TetGen,
     Abaqus,
+    Nrrd,
+    Nifti,
+    Dicom,
 }
 
 impl Format {
@@ -92,6 +101,12 @@ impl Format {
             Some(Format::Medit)
         } else if starts("*Heading") || starts("*Node") {
             Some(Format::Abaqus)
+        } else if bytes.starts_with(b"NRRD") {
+            Some(Format::Nrrd)
+        } else if nifti::is_plain(bytes) || nifti::is_gzip(bytes) {
+            Some(Format::Nifti)
+        } else if dicom::is_dicom(bytes) {
+            Some(Format::Dicom)
         } else if stl::is_binary(bytes) || starts("solid") {
             Some(Format::Stl)
         } else {
@@ -112,6 +127,9 @@ impl Format {
             "mesh" | "meshb" => Some(Format::Medit),
             "node" | "ele" => Some(Format::TetGen),
             "inp" => Some(Format::Abaqus),
+            "nrrd" | "nhdr" => Some(Format::Nrrd),
+            "nii" | "gz" => Some(Format::Nifti),
+            "dcm" => Some(Format::Dicom),
             _ => None,
         }
     }
@@ -179,6 +197,33 @@ pub fn read_paid(
     limits: &ReadLimits,
     pay: &mut dyn FnMut(u64) -> bool,
 ) -> Result<ReadMesh, MeshError> {
+    read_any(name, bytes, None, unit, neighbours, limits, pay)
+}
+
+/// Reads the surface around a label of a label map (NRRD, NIfTI or DICOM) like [`read`]: a closed surface without the stairs of
+/// voxels, whose volume is that of the voxels with the label. [`read`] does so if a file has one label.
+///
+/// # Errors
+/// Returns the refusals of [`read`], and refuses other formats, 0, and a label that no voxel has.
+pub fn read_label(
+    name: &str,
+    bytes: &[u8],
+    label: i64,
+    unit: Unit,
+    limits: &ReadLimits,
+) -> Result<ReadMesh, MeshError> {
+    read_any(name, bytes, Some(label), unit, &|_| None, limits, &mut |_| true)
+}
+
+fn read_any(
+    name: &str,
+    bytes: &[u8],
+    label: Option<i64>,
+    unit: Unit,
+    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
+    limits: &ReadLimits,
+    pay: &mut dyn FnMut(u64) -> bool,
+) -> Result<ReadMesh, MeshError> {
     let fail = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
     if bytes.len() > limits.bytes {
         return Err(fail(Problem::TooLarge { what: "bytes", limit: limits.bytes }));
@@ -197,6 +242,10 @@ pub fn read_paid(
         draft.notes.push(format!("The file's content is {format:?}, not what its extension says."));
     }
     let source = Source::new(name, bytes);
+    if label.is_some() && !matches!(format, Format::Nrrd | Format::Nifti | Format::Dicom) {
+        let message = format!("a file of {format:?} has no labels: leave `label` out");
+        return Err(fail(Problem::Unsupported { message }));
+    }
     match format {
         Format::Obj => obj::read(source, &mut draft)?,
         Format::Stl => stl::read(source, &mut draft)?,
@@ -208,6 +257,17 @@ pub fn read_paid(
         Format::Medit => medit::read(source, &mut draft)?,
         Format::TetGen => tetgen::read(name, bytes, neighbours, &mut draft)?,
         Format::Abaqus => abaqus::read(source, &mut draft)?,
+        Format::Nrrd | Format::Nifti | Format::Dicom => {
+            let map = match format {
+                Format::Nrrd => nrrd::read(source)?,
+                Format::Nifti => nifti::read(name, bytes)?,
+                _ => dicom::read(name, bytes, &mut draft.allowance)?,
+            };
+            map.surface(label, &mut draft).map_err(fail)?;
+            if let Some(own) = map.unit_m.filter(|own| *own != unit.metres()) {
+                draft.notes.push(format!("The file says that its lengths are in units of {own} m, not in {unit}."));
+            }
+        }
     }
     draft.finish(name, unit)
 }

@@ -1,6 +1,7 @@
 //! An octahedron in every format that can be read, for the tests of the readers and as a seed for fuzzing.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
+mod label_maps;
 mod others;
 
 use std::fmt::Write;
@@ -10,6 +11,8 @@ use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use palpate_geometry::TriangleMesh;
 
+#[allow(unused_imports)]
+pub use label_maps::*;
 pub use others::*;
 
 /// Corners of an octahedron, mm.
