@@ -8,7 +8,8 @@ use clap::{Parser, Subcommand};
 #[cfg(windows)]
 use program::service;
 use program::{
-    Failure, certificate, check, client, journal, mesh, organ, render, run, say, serve, texture, token, within_memory,
+    Failure, certificate, check, client, fit, journal, mesh, organ, render, run, say, serve, texture, token,
+    within_memory,
 };
 
 /// A server for touching soft tissue over a network.
@@ -41,6 +42,18 @@ enum ServerCommand {
         the force law reaches.\n\n\
         Exit status: 0, with warnings too; 2 when an input was refused.")]
     Check(check::CheckArguments),
+    /// Fit the parameters of a scene to measured curves of force over depth, and write the scene: Young's modulus, Poisson's ratio,
+    /// viscosity and branches of a solid; stiffness, foundation and damping of a mesh or a sheet
+    #[command(after_help = "Examples:\n  \
+        palpate fit curves.csv phantom --tip sphere --radius-mm 6 --output fitted.toml --plot fit.svg\n  \
+        palpate fit curves.csv my-scene.toml --parameter material.youngs_modulus_pa\n  \
+        palpate fit curves.csv liver --json\n\n\
+        Each curve is a press of a tip: its depth is imposed over time in runs of the tissue, and the forces are compared. \
+        docs/fitting.md describes the table and the result. Prints each parameter with its 95 % interval; one that the curves \
+        can't tell keeps its value, or is refused if --parameter names it.\n\n\
+        Exit status: 0; 1 when the fit failed or a file can't be written; 2 when an input was refused, or the curves can't tell a \
+        parameter that --parameter names.")]
+    Fit(fit::FitArguments),
     /// Draw a tissue while a script acts on it, without a screen: a PNG image of one moment, or a GIF of the whole script
     #[command(after_help = "Examples:\n  \
         palpate render paper oblique-100 --output poke.png\n  \
@@ -191,6 +204,7 @@ fn main() -> ExitCode {
     let ended = match palpate_arguments::parse::<ServerArguments>().command {
         ServerCommand::Run(arguments) => within_memory(|| run::run_script(&arguments)),
         ServerCommand::Check(arguments) => within_memory(|| check::check(&arguments)),
+        ServerCommand::Fit(arguments) => within_memory(|| fit::fit_curves(&arguments)),
         ServerCommand::Render(arguments) => within_memory(|| render::render(&arguments)),
         ServerCommand::Texture(arguments) => within_memory(|| texture::make_texture(&arguments)),
         ServerCommand::Mesh(arguments) => within_memory(|| mesh::mesh(&arguments)),

@@ -7,7 +7,7 @@ use std::process::Command;
 
 /// The crates of more than a few files, and the order of their modules: each may use those before it. `*` is all
 /// others.
-const MODULES: [(&str, &[&str]); 5] = [
+const MODULES: [(&str, &[&str]); 6] = [
     (
         "crates/tissue",
         &[
@@ -32,13 +32,14 @@ const MODULES: [(&str, &[&str]); 5] = [
         ],
     ),
     ("crates/exercise", &["*"]),
+    ("crates/fitting", &["parallel", "search", "uncertainty", "*", "fit"]),
     ("crates/session", &["budget", "*", "surface", "wire", "journal"]),
     ("crates/realtime", &["priority", "ids", "*"]),
     (".", &["server", "render"]),
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 18] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 19] = [
     ("crates/refusal", "palpate-refusal", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("crates/arguments", "palpate-arguments", &["palpate-refusal"], &["prost", "tokio", "tonic"]),
     ("crates/geometry", "palpate-geometry", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
@@ -82,6 +83,12 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 18] = [
         &["axum", "clap", "gif", "hyper", "rcgen", "tokio-rustls"],
     ),
     (
+        "crates/fitting",
+        "palpate-fitting",
+        &["palpate-haptics", "palpate-refusal", "palpate-session", "palpate-tissue"],
+        &["axum", "clap", "gif", "hyper", "rcgen", "tokio-rustls"],
+    ),
+    (
         "crates/realtime",
         "palpate-realtime",
         &["palpate-haptics", "palpate-refusal", "palpate-session", "palpate-tissue"],
@@ -100,6 +107,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 18] = [
             "palpate-arguments",
             "palpate-cluster",
             "palpate-exercise",
+            "palpate-fitting",
             "palpate-geometry",
             "palpate-haptics",
             "palpate-proto",
@@ -157,6 +165,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 18] = [
         "palpate-python",
         &[
             "palpate-client",
+            "palpate-fitting",
             "palpate-haptics",
             "palpate-proto",
             "palpate-refusal",

@@ -299,3 +299,73 @@ fn who_does_what_an_exercise_asks_earns_it_and_who_does_not_earns_little() {
         assert!(range.contains(&percent), "{script} earns {percent} % of {exercise}: {score}");
     }
 }
+
+/// A table of a press on a sheet, as the product simulates it.
+fn measured(sets: &[&str]) -> String {
+    use palpate_session::press::ImposedPress;
+    use std::fmt::Write;
+    let model = palpate_tissue::Model::parse("sheet", SHEET, sets).unwrap();
+    let time_s: Vec<f64> = (0..=50).map(|k| 0.01 * f64::from(k)).collect();
+    let press = ImposedPress {
+        place_m: None,
+        shape: palpate_haptics::TipShape::Disc,
+        radius_m: 0.02,
+        depth_m: time_s.iter().map(|time_s| 0.01 * time_s).collect(),
+        time_s,
+    };
+    let limits = palpate_tissue::limits::Limits::default();
+    let forces_n = press.forces_n(&model, &limits, &std::sync::atomic::AtomicBool::new(false)).unwrap();
+    let mut text = "# a machine in a cellar\nTime (ms),Depth (mm),Force (mN)\n".to_owned();
+    for ((time_s, depth_m), force_n) in press.time_s.iter().zip(&press.depth_m).zip(&forces_n) {
+        writeln!(text, "{},{},{}", 1e3 * time_s, 1e3 * depth_m, 1e3 * force_n).unwrap();
+    }
+    text
+}
+
+/// A sheet on soft ground.
+const SHEET: &str = "name = \"sheet\"   # of ours\n[sheet]\npoints = [17, 17]\nspacing_m = 0.005\npoint_mass_kg = 1e-4\n[springs]\n\
+                     stiffness_n_per_m = 10.0\n[anchor_springs]\nstiffness_n_per_m = 2.0   # a guess\n[damping]\n\
+                     coefficient_n_s_per_m = 0.02\n[stepping]\ntolerance = 1e-3\n";
+
+#[test]
+fn a_fit_gives_back_the_stiffness_and_writes_a_scene_that_has_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("sheet.toml"), SHEET).unwrap();
+    std::fs::write(at("lab.csv"), measured(&["anchor_springs.stiffness_n_per_m=5.0"])).unwrap();
+    let anchor = "anchor_springs.stiffness_n_per_m";
+    let fit = |further: &[&str]| {
+        let arguments =
+            [&["fit", "lab.csv", "sheet.toml", "--radius-mm", "20", "--parameter", anchor], further].concat();
+        palpate(folder.path(), &arguments)
+    };
+    says(fit(&["--output", "fitted.toml", "--plot", "fit.svg"]), 0, &[anchor, "95 % interval", "residual", "runs"]);
+    let fitted = std::fs::read_to_string(at("fitted.toml")).unwrap();
+    for part in [
+        "# Fitted to lab.csv (1 curve, 51 samples)",
+        "# Curves: a machine in a cellar",
+        "name = \"sheet\"   # of ours",
+        "# a guess",
+    ] {
+        assert!(fitted.contains(part), "`{part}` is not in {fitted}");
+    }
+    let scene = palpate_tissue::scene::Scene::load(&at("fitted.toml"), &[], &palpate_tissue::limits::Limits::default());
+    let found = scene.unwrap().anchor_stiffness_n_per_m;
+    assert!((found / 5.0 - 1.0).abs() < 0.01, "{found}");
+    assert!(std::fs::read_to_string(at("fit.svg")).unwrap().contains("<polyline"));
+    let (status, text) = fit(&["--json", "--threads", "1"]);
+    let told: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!((status, told["parameters"][0]["name"].as_str()), (0, Some(anchor)));
+    assert!((told["parameters"][0]["value"].as_f64().unwrap() / found - 1.0).abs() < 1e-5, "{told}");
+    // A slow press says nothing of damping.
+    let damping = "damping.coefficient_n_s_per_m";
+    says(fit(&["--parameter", damping]), 2, &[damping, "the curves can't tell it", "What tells it: presses at speeds"]);
+    says(
+        fit(&["--parameter", "springs.stifness_n_per_m"]),
+        2,
+        &["--parameter", "did you mean `springs.stiffness_n_per_m`?"],
+    );
+    says(fit(&["--parameter", "material.poissons_ratio"]), 2, &["is none of this tissue's parameters"]);
+    std::fs::write(at("lab.csv"), "time_s,depth_mm,force_lb\n").unwrap();
+    says(fit(&[]), 2, &["lab.csv:1: force_lb: unknown unit `lb`"]);
+}

@@ -3,6 +3,7 @@
 pub(crate) mod certificate;
 pub(crate) mod check;
 pub(crate) mod client;
+pub(crate) mod fit;
 pub(crate) mod indent;
 pub(crate) mod journal;
 mod log;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use palpate_refusal::Refusal;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::collection::find_scene;
+use palpate_tissue::scene::collection::{find_scene, scene_text};
 
 use super::{Failure, load_config};
 
@@ -23,6 +23,18 @@ pub(crate) struct SceneArguments {
     /// Configuration file (TOML) with other limits, in a section [limits]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+}
+
+impl SceneArguments {
+    /// Returns the scene's name in refusals, its text, and the folder of the files that it names.
+    pub(super) fn text(&self, limits: &Limits) -> Result<(String, String, PathBuf), Refusal> {
+        scene_text(&self.scene, &self.scenes, limits)
+    }
+
+    /// Returns the values of `--set`, in their order.
+    pub(super) fn assignments(&self) -> &[String] {
+        &self.set
+    }
 }
 
 /// Compiles the scene that the arguments name; returns it with the limits in force.

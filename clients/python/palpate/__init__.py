@@ -1,6 +1,7 @@
 """Simulated soft tissue to touch: in this process at full speed, over a network, and from recordings.
 
-In this process, `run` plays a script on a scene, `study` plays many of them on several threads, and a `Session` is a tissue that
+In this process, `run` plays a script on a scene, `study` plays many of them on several threads, `fit` finds the parameters of
+a scene by measured curves, and a `Session` is a tissue that
 you step and touch yourself. `connect` (and `palpate.aio.connect`) connects to a server, and `load` measures how much load it can
 take. A `Journal` is a recorded session, and `Offline` renders the forces of a recorded touch.
 
@@ -14,6 +15,7 @@ __path__ = pkgutil.extend_path(__path__, __name__)
 
 from . import aio  # noqa: E402
 from ._errors import Disconnected, Error, Failed, Refused
+from ._fit import Curve, Fit
 from ._journal import Commands, Verdict
 from ._native import (
     Frames,
@@ -30,6 +32,7 @@ from ._native import (
     Tissue,
     __version__,
     devices,
+    fit,
     run,
     scenes,
     scripts,
@@ -44,9 +47,11 @@ __all__ = [
     "Client",
     "Commands",
     "Course",
+    "Curve",
     "Disconnected",
     "Error",
     "Failed",
+    "Fit",
     "Frame",
     "Frames",
     "Hand",
@@ -70,6 +75,7 @@ __all__ = [
     "aio",
     "connect",
     "devices",
+    "fit",
     "load",
     "press",
     "run",

@@ -10,6 +10,8 @@ from ._errors import Disconnected as Disconnected
 from ._errors import Error as Error
 from ._errors import Failed as Failed
 from ._errors import Refused as Refused
+from ._fit import Curve as Curve
+from ._fit import Fit as Fit
 from ._journal import Commands as Commands
 from ._journal import Course as _ToolCourse
 from ._journal import Verdict as Verdict
@@ -537,6 +539,17 @@ def load(
     *,
     report: Optional[Union[str, PathLike[str]]] = None,
 ) -> dict[str, Any]: ...
+def fit(
+    scene: Union[Scene, Tissue, Source],
+    curves: Union[Curve, Sequence[Curve], Source],
+    *,
+    parameters: Optional[Sequence[str]] = None,
+    threads: Optional[int] = None,
+) -> Fit:
+    """Fits parameters of a scene to measured curves of force over depth, as `palpate fit` does: `curves` are one or several
+    `Curve`, or the path of a table. `parameters` are keys of the scene such as "material.youngs_modulus_pa"; by default all
+    that the scene has and the curves can tell. Raises Refused if the curves can't tell one that is named."""
+
 def run(
     scene: Union[Scene, Tissue, Source], script: Union[Script, Source], *, held: bool = False, audit: bool = False
 ) -> Run:

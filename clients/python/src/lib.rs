@@ -15,6 +15,7 @@ mod client;
 mod device;
 mod ending;
 mod error;
+mod fit;
 mod hand;
 mod instrument;
 mod journal;
@@ -51,6 +52,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<streams::FrameStream>()?;
     module.add_function(wrap_pyfunction!(scene::scenes, module)?)?;
     module.add_function(wrap_pyfunction!(scene::scripts, module)?)?;
+    module.add_function(wrap_pyfunction!(fit::fit, module)?)?;
     module.add_function(wrap_pyfunction!(run::run, module)?)?;
     module.add_function(wrap_pyfunction!(run::study, module)?)?;
     module.add_function(wrap_pyfunction!(device::devices, module)?)?;

@@ -110,6 +110,11 @@ impl Scene {
         Bound::new(value.py(), Scene::new(value, None, "scenes".into(), None)?)
     }
 
+    /// Returns the scene of a fit.
+    pub(crate) fn fitted(scene: scene::Scene) -> Self {
+        Scene { place: scene.name.clone(), scene, plan: None, model: Mutex::new(None) }
+    }
+
     /// Returns the tissue, which is compiled once.
     pub(crate) fn compiled(&self, stop: &AtomicBool) -> Result<Arc<Model>, Refusal> {
         let mut model = self.model.lock().unwrap_or_else(PoisonError::into_inner);

@@ -7,11 +7,12 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_haptics::TipShape;
 use palpate_refusal::Result;
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::{Footprint, Model};
 
+use super::press::on_surface;
 use super::run::{RunEvent, RunOptions, run_with};
 use super::simulation::SimulationFailure;
 
@@ -103,7 +104,7 @@ impl Indentation {
     /// # Errors
     /// Refuses a tip that does not suit the tissue, with the fields of a script.
     fn script(&self, model: &Model, limits: &Limits) -> Result<(Script, DVec3, DVec3)> {
-        let (place_m, outward) = self.on_surface(model);
+        let (place_m, outward) = on_surface(model, self.place_m, self.radius_m);
         let away_m = CLEARANCE * self.radius_m;
         let height_m = self.shape.height_m(self.radius_m);
         let at = |out_m: f64| (place_m + (height_m + out_m) * outward).to_array();
@@ -116,12 +117,6 @@ impl Indentation {
         }
         text += "]\n";
         Ok((Script::parse("indent", &text, Path::new(""), &model.scene, limits)?, place_m, outward))
-    }
-
-    /// Returns the place of the rest surface where the tip goes in, m, and the direction out of the tissue there.
-    fn on_surface(&self, model: &Model) -> (DVec3, DVec3) {
-        let wanted_m = self.place_m.unwrap_or_else(|| model.shape().pressed_m());
-        Footprint::new(model, self.radius_m, wanted_m).at_rest()
     }
 
     /// Returns the times at which the tip has arrived at its depth, leaves it, and is back, s.

@@ -286,6 +286,32 @@ impl Model {
         Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
     }
 
+    /// Compiles another scene of the same points with the scheme and the number format of this model, without rehearsals, and with
+    /// the fewest substeps that are as short beside the fastest vibration as those of this model. So the force of a run depends
+    /// smoothly on the scene's coefficients. The expected error and the sleep tolerance are those of this model.
+    ///
+    /// # Errors
+    /// Refuses every scene that [`Scene::check`] refuses, and more substeps than `limits.substeps`, which stability needs
+    /// ([`Reason::TooLarge`]).
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn compile_alike(&self, scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        // Substeps may be that much longer, so that coefficients a little beyond those of this model have as many.
+        const SLACK: f64 = 0.97;
+        scene.check(limits)?;
+        let scene = scene.clone().with_unsigned_zeros();
+        let sheet = Oscillator::of(&scene);
+        let step_s = scene.stepping.rate_hz.recip();
+        let faster = SLACK * sheet.omega_bound_per_s() / self.omega_bound_per_s;
+        let Plan { integrator, substeps, .. } = self.plan;
+        let mut substeps = (f64::from(substeps) * faster).ceil().clamp(1.0, f64::from(u32::MAX)) as u32;
+        while substeps <= limits.substeps && !Plan::new(integrator, substeps, step_s, &sheet).stable {
+            substeps += 1 + substeps / 16;
+        }
+        let choice = Choice { integrator, substeps, precision: self.precision, expected_error: self.expected_error };
+        let model = Model::chosen(&scene, choice, 0, limits, &scheme_selection::NEVER)?;
+        Ok(Arc::new(Model { sleep_tolerance: self.sleep_tolerance, ..Arc::unwrap_or_clone(model) }))
+    }
+
     /// Compiles the models of successive changes, each with the step at which it applies. Each change builds on
     /// the one before it; the first builds on `self`. Returns the steps and models in the order of `changes`,
     /// which is not checked. `first` is the scene that the session began with. Blocks for each change as

@@ -186,10 +186,23 @@ const SCRIPTS: &str = "scripts";
 /// Refuses an unknown name or a file of the other kind, as [`Collection::text`] does; a file that can't be
 /// read; and every text or assignment that [`Scene::parse_in`] refuses.
 pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
-    let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
+    let (name, text, folder) = scene_text(path, folder, limits)?;
+    Scene::parse_in(&folder, &name, &text, assignments, limits)
+}
+
+/// Returns the scene that a user gave, as to [`find_scene`]: the name that refusals use for it, its text, and the folder of the files
+/// that it names.
+///
+/// # Errors
+/// Refuses an unknown name, and a file that can't be read.
+pub fn scene_text(path: &Path, folder: &Path, limits: &Limits) -> Result<(String, String, PathBuf)> {
+    let Some(name) = name_in(path) else {
+        let of_files = path.parent().unwrap_or(Path::new("")).to_owned();
+        return Ok((path.display().to_string(), files::read_text(path, limits.file_bytes)?, of_files));
+    };
     let scenes = Collection::new(TextKind::Scene, folder).for_user();
     let (file, text) = scenes.text(name, &Collection::new(TextKind::Script, Path::new(SCRIPTS)), limits)?;
-    Scene::parse_in(folder, &file, &text, assignments, limits)
+    Ok((file, text, folder.to_owned()))
 }
 
 /// Returns the script that a user gave (a file, or the name of one in ./scripts or of a built-in one): the name

@@ -28,6 +28,7 @@ mod source;
 mod springs;
 mod stepping;
 pub mod tie;
+pub mod tissue_parameter;
 pub mod toml_document;
 mod volume;
 mod zero;

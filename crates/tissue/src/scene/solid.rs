@@ -116,7 +116,7 @@ impl SolidMaterial {
         self.youngs_modulus_pa * self.shear_over_youngs()
     }
 
-    fn check(&self) -> Result<()> {
+    pub(super) fn check(&self) -> Result<()> {
         for (field, value) in [
             ("material.youngs_modulus_pa", self.youngs_modulus_pa),
             ("material.density_kg_per_m3", self.density_kg_per_m3),
@@ -230,6 +230,11 @@ impl Solid {
         let new = || Foundation::new(n_per_m3, &self.shape, &self.masses);
         let foundation = if n_per_m3 > 0.0 { new() } else { Foundation::default() };
         Ok(Solid { foundation, slowest: SlowestVibration::default(), ..self.clone() })
+    }
+
+    /// Returns the solid of another material, unchecked ([`SolidMaterial::check`]).
+    pub(super) fn of_material(&self, material: SolidMaterial) -> Self {
+        Solid { material, slowest: SlowestVibration::default(), ..self.clone() }
     }
 
     /// Returns the solid under gravity.
@@ -585,7 +590,7 @@ pub(super) fn read_material(
     let Some(material) = material else { return Err(fields.refuse(Reason::Missing, "material", "is missing")) };
     let branches = branches.map_or(Ok(Branches::default()), Branches::read)?;
     let material = SolidMaterial { branches, ..material.table(SolidMaterial::read)? };
-    let solid = Solid { material, slowest: SlowestVibration::default(), ..solid.clone() };
+    let solid = solid.of_material(material);
     let solid = solid.with_gravity(gravity.map_or(Ok(Gravity::default()), Gravity::read)?);
     let Some(layers) = layers else { return Ok(solid) };
     solid.with_layers(&layers.tables()?.iter().map(Layer::read).collect::<Result<Vec<_>>>()?, "layer")

@@ -1,0 +1,176 @@
+//! Curves of a known tissue with noise give that tissue back, as often as the intervals say.
+#![allow(clippy::unwrap_used, clippy::disallowed_methods)]
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use fastrand::Rng;
+use palpate_fitting::curve_file::MeasuredCurve;
+use palpate_fitting::fit::{Fit, FitOptions, fit};
+use palpate_haptics::TipShape;
+use palpate_session::press::ImposedPress;
+use palpate_session::simulation::SimulationFailure;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::collection::find_scene;
+use palpate_tissue::scene::tissue_parameter::TissueParameter;
+use palpate_tissue::scene::{Named, Scene};
+
+/// Standard deviation of the noise, of the largest force.
+const NOISE: f64 = 0.02;
+
+fn scene(name: &str, sets: &[&str]) -> Scene {
+    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    find_scene(name.as_ref(), "scenes".as_ref(), &sets, &Limits::default()).unwrap()
+}
+
+/// A press in `into_s` to a depth, which is held for `holds_s`, in samples of `every_s`.
+fn ramp(shape: TipShape, radius_m: f64, depth_m: f64, [into_s, holds_s, every_s]: [f64; 3]) -> ImposedPress {
+    let samples = ((into_s + holds_s) / every_s).round() as usize;
+    let time_s: Vec<f64> = (0..=samples).map(|k| every_s * k as f64).collect();
+    let depth_m = time_s.iter().map(|time_s| depth_m * (time_s / into_s).min(1.0)).collect();
+    ImposedPress { place_m: None, shape, radius_m, time_s, depth_m }
+}
+
+/// A press that vibrates about a depth, from 0 to twice that.
+fn vibration(shape: TipShape, radius_m: f64, depth_m: f64, frequency_hz: f64, lasts_s: f64) -> ImposedPress {
+    let samples = (lasts_s * 200.0).round() as usize;
+    let time_s: Vec<f64> = (0..=samples).map(|k| 0.005 * k as f64).collect();
+    let turn = |time_s: &f64| (std::f64::consts::TAU * frequency_hz * time_s).cos();
+    let depth_m = time_s.iter().map(|time_s| depth_m * (1.0 - turn(time_s))).collect();
+    ImposedPress { place_m: None, shape, radius_m, time_s, depth_m }
+}
+
+/// Curves of a tissue, and what fits them.
+struct Case {
+    truth: Scene,
+    start: Arc<Model>,
+    presses: Vec<ImposedPress>,
+    forces_n: Vec<Vec<f64>>,
+    parameters: Vec<TissueParameter>,
+}
+
+impl Case {
+    /// The fit begins with `factors` of the true values.
+    fn new(truth: Scene, presses: Vec<ImposedPress>, factors: &[(TissueParameter, f64)]) -> Self {
+        let model = Model::compile(&truth, &Limits::default()).unwrap();
+        let run = |press: &ImposedPress| press.forces_n(&model, &Limits::default(), &AtomicBool::new(false)).unwrap();
+        let forces_n = presses.iter().map(run).collect();
+        let begun = factors.iter().fold(truth.clone(), |scene, (parameter, factor)| {
+            parameter.set(&scene, factor * parameter.value(&truth).unwrap()).unwrap()
+        });
+        let start = Model::compile(&begun, &Limits::default()).unwrap();
+        Case { truth, start, presses, forces_n, parameters: factors.iter().map(|factor| factor.0).collect() }
+    }
+
+    fn curves(&self, seed: u64) -> Vec<MeasuredCurve> {
+        let mut random = Rng::with_seed(seed);
+        // Box and Muller, 1958.
+        let mut normal = || (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (std::f64::consts::TAU * random.f64()).cos();
+        let largest_n = self.forces_n.iter().flatten().fold(0.0_f64, |largest, force_n| largest.max(*force_n));
+        let noisy = |(press, forces_n): (&ImposedPress, &Vec<f64>)| MeasuredCurve {
+            name: String::new(),
+            press: press.clone(),
+            force_n: forces_n.iter().map(|force_n| force_n + NOISE * largest_n * normal()).collect(),
+        };
+        self.presses.iter().zip(&self.forces_n).map(noisy).collect()
+    }
+
+    fn fit(&self, seed: u64, parameters: &[TissueParameter]) -> Result<Fit, SimulationFailure> {
+        let limits = Limits::default();
+        let options = FitOptions { parameters, threads: 2, limits: &limits, stop: &AtomicBool::new(false) };
+        fit(&self.start, &self.curves(seed), &options, &mut |_| {})
+    }
+
+    /// Fits `seeds` noises; prints how often each parameter is within its interval, and its largest error, and returns the least
+    /// share.
+    fn recover(&self, what: &str, seeds: u64) -> (f64, f64) {
+        let begun = Instant::now();
+        let (mut within, mut worst, mut width) = (vec![0_u32; 8], vec![0.0_f64; 8], vec![0.0_f64; 8]);
+        let mut runs = 0;
+        for seed in 0..seeds {
+            let fit = self.fit(seed, &self.parameters).unwrap();
+            runs += fit.runs;
+            for (index, found) in fit.parameters.iter().enumerate() {
+                let truth = found.parameter.value(&self.truth).unwrap();
+                let [low, high] = found.interval;
+                within[index] += u32::from(low <= truth && truth <= high);
+                worst[index] = worst[index].max((found.value / truth - 1.0).abs());
+                width[index] = width[index].max((high - low) / 2.0 / truth);
+            }
+        }
+        let mut parameters = self.parameters.clone();
+        parameters.sort_by_key(|of| TissueParameter::NAMES.iter().position(|entry| entry.1 == *of));
+        for (index, parameter) in parameters.iter().enumerate() {
+            println!(
+                "{what} {}: {} of {seeds} within the interval, largest error {:.2} %, interval up to ±{:.2} %",
+                parameter.name(),
+                within[index],
+                100.0 * worst[index],
+                100.0 * width[index]
+            );
+        }
+        let wall_s = begun.elapsed().as_secs_f64() / seeds as f64;
+        println!(
+            "{what}: {} points, {} substeps, {} runs and {wall_s:.2} s a fit",
+            self.start.len(),
+            self.start.plan.substeps,
+            runs / seeds
+        );
+        let least = within[..parameters.len()].iter().min().unwrap();
+        (f64::from(*least) / seeds as f64, worst[0])
+    }
+}
+
+use TissueParameter as P;
+
+/// A liver under two tips, slowly and with vibration.
+fn sheet() -> Case {
+    let truth = scene("liver", &[]);
+    let presses = vec![
+        ramp(TipShape::Disc, 0.005, 0.008, [0.5, 0.0, 0.005]),
+        ramp(TipShape::Disc, 0.015, 0.008, [0.5, 0.0, 0.005]),
+        vibration(TipShape::Disc, 0.010, 0.002, 20.0, 0.5),
+    ];
+    Case::new(truth, presses, &[(P::SpringStiffness, 0.4), (P::AnchorStiffness, 2.0), (P::Damping, 3.0)])
+}
+
+fn surface() -> Case {
+    let truth = scene("gallbladder", &["mesh.organ.edge_m=0.0035"]);
+    let presses = vec![
+        ramp(TipShape::Disc, 0.003, 0.009, [0.5, 0.0, 0.005]),
+        ramp(TipShape::Disc, 0.009, 0.006, [0.5, 0.0, 0.005]),
+        vibration(TipShape::Disc, 0.006, 0.001, 20.0, 0.5),
+    ];
+    Case::new(truth, presses, &[(P::YoungsModulus, 0.4), (P::Foundation, 2.0), (P::DampingRatio, 2.0)])
+}
+
+fn solid(cell: &str) -> Case {
+    let truth = scene("phantom", &[cell, "material.viscosity_pa_s=5.0"]);
+    let presses = vec![
+        ramp(TipShape::RigidDisc, 0.008, 0.003, [0.5, 0.0, 0.005]),
+        ramp(TipShape::RigidDisc, 0.025, 0.004, [0.5, 0.0, 0.005]),
+        vibration(TipShape::RigidDisc, 0.012, 0.001, 20.0, 0.5),
+    ];
+    Case::new(truth, presses, &[(P::YoungsModulus, 0.3), (P::PoissonsRatio, 0.7), (P::Viscosity, 0.05)])
+}
+
+#[test]
+fn a_sheet_a_surface_and_a_solid_are_given_back_within_their_intervals() {
+    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
+    for (what, case) in [("sheet", sheet()), ("surface", surface()), ("solid", solid("solid.cell_m=0.013"))] {
+        case.recover(what, 1);
+    }
+}
+
+#[test]
+#[ignore = "takes some minutes"]
+fn fifty_noises_are_within_the_intervals_as_often_as_these_say() {
+    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
+    for (what, case) in [("sheet", sheet()), ("surface", surface()), ("solid", solid("solid.cell_m=0.01"))] {
+        let (share, error) = case.recover(what, 50);
+        assert!(share >= 0.9 && error < 0.03, "{what}: {share}, {error}");
+    }
+    solid("solid.cell_m=0.0055").recover("solid of 3,000 cells", 1);
+}
