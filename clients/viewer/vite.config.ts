@@ -11,6 +11,7 @@ export default defineConfig({
     // A picture within the page would need another content security policy.
     assetsInlineLimit: 0,
     modulePreload: { polyfill: false },
+    rolldownOptions: { input: ["index.html", "trainer.html"] },
   },
   server: { proxy: { "^/(palpate\\.v1\\.|textures/)": server } },
 });

@@ -4,6 +4,7 @@ import type { DescMessage, MessageShape } from "@bufbuild/protobuf";
 import { Code, ConnectError, type Client, createClient, type Interceptor } from "@connectrpc/connect";
 import { createGrpcWebTransport } from "@connectrpc/connect-web";
 import { ErrorInfoSchema } from "./gen/google/rpc/error_details_pb.js";
+import { ExerciseService } from "./gen/palpate/v1/exercise_pb.js";
 import { HapticService } from "./gen/palpate/v1/haptic_pb.js";
 import { type Session, SessionService } from "./gen/palpate/v1/session_pb.js";
 import { ViewService } from "./gen/palpate/v1/view_pb.js";
@@ -63,6 +64,7 @@ export class Server {
   readonly sessions: Client<typeof SessionService>;
   readonly haptics: Client<typeof HapticService>;
   readonly views: Client<typeof ViewService>;
+  readonly exercises: Client<typeof ExerciseService>;
   /** Whether calls are sent to the server that owns the session. */
   follows = true;
   /** Called when another server owns a session. */
@@ -110,6 +112,7 @@ export class Server {
     this.sessions = createClient(SessionService, transport);
     this.haptics = createClient(HapticService, transport);
     this.views = createClient(ViewService, transport);
+    this.exercises = createClient(ExerciseService, transport);
   }
 
   /** Returns the URL of the server that owns a session, as far as it is known here. */

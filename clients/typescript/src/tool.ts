@@ -6,7 +6,7 @@
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { Datagrams } from "./datagrams.js";
-import type { ClipSchema, CommandSchema, Sample, ThreadSchema, TieSchema, ToolSample } from "./gen/palpate/v1/haptic_pb.js";
+import type { ClipSchema, CommandSchema, MarkSchema, Sample, ThreadSchema, TieSchema, ToolSample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Lead, poseOf } from "./poses.js";
 import { backoffMs, describe, isGone, isUnreached, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
@@ -214,18 +214,29 @@ export class Tool {
     return this.tie({ number, kind: { case: "cut", value: {} } });
   }
 
-  private async tie(value: MessageInitShape<typeof TieSchema>): Promise<boolean> {
+  /** Marks a place of the surface, as an answer in an exercise; otherwise as `thread`. What the tool does goes on. */
+  mark(mark: MessageInitShape<typeof MarkSchema>): Promise<boolean> {
+    return this.act({ case: "mark", value: mark });
+  }
+
+  private tie(value: MessageInitShape<typeof TieSchema>): Promise<boolean> {
+    return this.act({ case: "tie", value });
+  }
+
+  /** Does what changes nothing about what the tool does. Returns whether the server accepts it. */
+  private async act(action: Action, isAgain = false): Promise<boolean> {
     if (!(await this.take())) return false;
     const { leaseId, sessionId, tool } = this;
     if (!leaseId) return false;
     this.touchedMs = performance.now();
-    const command = { tool, sequence: this.next(), action: { case: "tie" as const, value } };
+    const command = { tool, sequence: this.next(), action };
     try {
       await this.server.haptics.sendCommands({ sessionId, leaseId, commands: [command] }, { timeoutMs: CALL_TIMEOUT_MS });
       return true;
     } catch (error) {
       if (this.leaseId === leaseId) this.failed(error);
-      return false;
+      // The lease had ended, because this page came too late: the tool is taken again.
+      return reasonOf(error) === "NOT_HOLDER" && !isAgain ? this.act(action, true) : false;
     }
   }
 

@@ -5,14 +5,16 @@ import { type JournalName, lengthText, type Listed, listJournals, whenText } fro
 import { part } from "./page";
 import { entryOf, pictureOf } from "./pictures";
 import { DEFAULT_SCENE, groupOf, GROUPS, inOrder, titleOf } from "./scenes";
-import { backoffMs, isPassing, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
+import { backoffMs, exercises, isPassing, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
 import { excerpt } from "./text";
 
 /** What the user chose. */
-export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
+export type Choice = { kind: "scene"; scene: string } | { kind: "exercise"; exercise: string } | ({ kind: "live" | "recorded" } & JournalName);
 
 /** Maximum number of scenes in the list. */
 const MAX_SCENES = 1000;
+/** Maximum number of exercises in the list. */
+const MAX_EXERCISES = 200;
 /** Maximum number of entries in each group of recordings; the newest are listed. */
 const MAX_LISTED = 40;
 /** A list older than this is requested again when the user opens it. */
@@ -20,9 +22,12 @@ const OLD_MS = 3000;
 
 const keyOf = ({ sessionId, run }: JournalName, kind: "live" | "recorded") => `${kind} ${sessionId} ${run}`;
 
+const exerciseKey = (name: string) => `exercise ${name}`;
+
 export class Choices {
   private readonly list = part("scene", HTMLSelectElement);
   private readonly scenes = GROUPS.map(group);
+  private readonly exercises = group("Exercises");
   private readonly live = group("Live");
   private readonly recorded = group("Recorded");
   private readonly choices = new Map<HTMLOptionElement, Choice>();
@@ -34,7 +39,10 @@ export class Choices {
   constructor(onChoice: (choice: Choice) => void) {
     this.list.addEventListener("change", () => {
       const chosen = this.list.selectedOptions[0];
-      if (chosen) onChoice(this.choices.get(chosen) ?? { kind: "scene", scene: chosen.value });
+      if (!chosen) return;
+      const exercise = chosen.parentElement === this.exercises ? chosen.value.slice(exerciseKey("").length) : undefined;
+      if (exercise !== undefined) onChoice({ kind: "exercise", exercise });
+      else onChoice(this.choices.get(chosen) ?? { kind: "scene", scene: chosen.value });
     });
     for (const turn of ["pointerenter", "focus"] as const) {
       this.list.addEventListener(turn, () => {
@@ -59,7 +67,7 @@ export class Choices {
           group.replaceChildren(...within.map(entryOf));
           group.hidden = within.length === 0;
         });
-        this.list.replaceChildren(...this.scenes, this.live, this.recorded);
+        this.list.replaceChildren(...this.scenes, this.exercises, this.live, this.recorded);
         this.mark(this.marked.value, this.marked.name);
         break;
       } catch (error) {
@@ -67,7 +75,23 @@ export class Choices {
         await sleep(backoffMs(failures));
       }
     }
+    await this.fillExercises();
     await this.ask();
+  }
+
+  /** Fills the group of exercises, if the server has any. */
+  private async fillExercises(): Promise<void> {
+    try {
+      const listed = (await exercises.listExercises({}, { timeoutMs: CALL_TIMEOUT_MS })).exercises;
+      const entries = listed.slice(0, MAX_EXERCISES).map(({ name, title }) => new Option(excerpt(title || name), exerciseKey(name)));
+      this.exercises.replaceChildren(...entries);
+      this.exercises.hidden = entries.length === 0;
+      part("trainees-link", HTMLAnchorElement).hidden = entries.length === 0;
+      this.mark(this.marked.value, this.marked.name);
+    } catch {
+      // A server without exercises, or one that allows this caller none.
+      this.exercises.hidden = true;
+    }
   }
 
   /** Requests the recordings. Call this when they may have changed. */
@@ -94,11 +118,16 @@ export class Choices {
   }
 
   /** The page shows a live session. */
-  markScene(scene: string, sessionId = ""): void {
+  markScene(scene: string, sessionId = "", title = scene): void {
     const isOther = sessionId !== this.present;
     this.present = sessionId;
-    this.mark(scene, scene);
+    this.mark(scene, title);
     if (isOther && this.askedMs > 0) void this.ask();
+  }
+
+  /** The page shows the session of an exercise. */
+  markExercise(name: string, title: string, sessionId: string): void {
+    this.markScene(exerciseKey(name), sessionId, title);
   }
 
   /** The page shows a recording. */

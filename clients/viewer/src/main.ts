@@ -7,10 +7,11 @@
 // tool is held, another worker carries poses and samples by datagram, if possible. Without TLS a browser speaks
 // HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one acknowledgement at a time.
 
-import { create, type MessageInitShape } from "@bufbuild/protobuf";
+import { create as message, type MessageInitShape } from "@bufbuild/protobuf";
 import { norm, type Vec3 } from "palpate";
 import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
+import { ExercisePanel } from "./exercise";
 import type { Mode } from "./hand";
 import { HAND_NAMES, type Hands } from "./hands";
 import { Input } from "./input";
@@ -19,7 +20,7 @@ import { Latency } from "./latency";
 import { Lumps } from "./lumps";
 import { cutText, feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, undoText, wayText, wellText } from "./messages";
 import { Overlay, type ToolLabel } from "./overlay";
-import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
+import { addressed, asked, askedNumber, holderName, part, seekAt, withSession, writeAddress, writeMoment } from "./page";
 import { pageState } from "./page-state";
 import { keepPicture } from "./pictures";
 import { BACK_S, discard, type Opened, Player } from "./player";
@@ -89,6 +90,7 @@ let playing: AbortController | undefined;
 
 const choices = new Choices((choice) => {
   if (choice.kind === "scene") void open({ source: named(choice.scene), isNew: true });
+  else if (choice.kind === "exercise") void open({ source: forExercise(choice.exercise), isNew: true });
   else if (choice.kind === "live") void open({ sessionId: choice.sessionId, isNew: true });
   else void open({ moment: choice, isNew: true });
 });
@@ -111,7 +113,7 @@ input.sewing = sewing;
 
 const lumps = new Lumps(stage, input, {
   present: () => shownSession,
-  scene: () => (made?.case === "scene" && !shownSession?.session.playback ? create(SceneSchema, made.value) : undefined),
+  scene: () => (made?.case === "scene" && !shownSession?.session.playback ? message(SceneSchema, made.value) : undefined),
   exchange: async (scene) => {
     const of = shownSession;
     const source: Source = { case: "scene", value: scene };
@@ -121,6 +123,16 @@ const lumps = new Lumps(stage, input, {
     await show(session, { isNew: true, keeps: true });
     discard(of.session);
   },
+  notice,
+});
+
+const exercise = new ExercisePanel(stage, input, {
+  present: () => shownSession,
+  again: () => {
+    const name = shownSession?.session.exercise?.exercise?.name;
+    if (name !== undefined) void open({ source: forExercise(name), isNew: true });
+  },
+  share: (traineeId) => copy(withSession(traineeId), "Link copied. Who opens it does the exercise, and gets nothing that it hides."),
   notice,
 });
 
@@ -139,6 +151,7 @@ type Source = NonNullable<MessageInitShape<typeof CreateSessionRequestSchema>["s
 let made: Source | undefined;
 
 const named = (value: string): Source => ({ case: "sceneName", value });
+const forExercise = (value: string): Source => ({ case: "exercise", value: { source: { case: "name", value } } });
 
 /**
  * What to open: an existing session, a new one, or a recording from a step on. `isNew`: the user chose it on this
@@ -179,7 +192,7 @@ async function open(target: Target): Promise<void> {
       }
       const session = sessionId
         ? (await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS })).session
-        : (await sessions.createSession({ source: (made ??= named(await choices.first())), idleTimeoutS: IDLE_S }, {})).session;
+        : await create((made ??= named(await choices.first())));
       if (!session) throw new RangeError("it tells of no session");
       // Playback of another window: this window gets its own.
       if (session.playback) return await open({ moment: { ...session.playback, step: Number(session.step) } });
@@ -202,6 +215,15 @@ async function open(target: Target): Promise<void> {
       await sleep(waitMs, hurry.signal);
     }
   }
+}
+
+/** Creates a session. Who chooses an exercise does it: the page goes on with the trainee's ID, and forgets the trainer's. */
+async function create(source: Source): Promise<Session | undefined> {
+  const isExercise = source.case === "exercise";
+  const { session } = await sessions.createSession({ source, paused: isExercise, idleTimeoutS: IDLE_S }, {});
+  const traineeId = session?.exercise?.traineeId;
+  if (!traineeId) return session;
+  return (await sessions.getSession({ sessionId: traineeId }, { timeoutMs: CALL_TIMEOUT_MS })).session;
 }
 
 /** Asks at once whether a lost server is back. */
@@ -302,7 +324,9 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   sewing.begin();
   tissue.begin(session);
   const name = session.scene?.name ?? "";
+  const of = session.exercise?.exercise;
   if (session.playback) choices.markRecorded(session.playback, name);
+  else if (of) choices.markExercise(of.name, of.title, session.sessionId);
   else choices.markScene(name, session.sessionId);
   if (!former) {
     showing += 1;
@@ -313,6 +337,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     overlay.point();
   }
   lumps.show(session);
+  exercise.show(next);
   part("arriving", HTMLElement).hidden = true;
   document.body.classList.remove("empty");
   // Data of the previous session is no longer valid.
@@ -413,6 +438,7 @@ function heard(session: Session): void {
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
   tellUndo(shownSession);
+  exercise.heard();
   sewing.tell();
   warnIfExhausted(shownSession);
   holding();
@@ -594,12 +620,15 @@ document.addEventListener("fullscreenchange", () => {
 });
 part("share", HTMLButtonElement).addEventListener("click", () => {
   if (player.moment) writeMoment(player.moment, player.moment.step, false);
-  // Browsers offer the clipboard only to pages from a secure origin or from this machine.
-  const failed = () => notice("The link could not be copied. Copy the address of this page instead.");
-  if (!isSecureContext) return failed();
-  const copied = () => notice(`Link copied. Anyone who opens it sees this ${player.isOpen ? "recording" : "session"}.`);
-  void navigator.clipboard.writeText(location.href).then(copied, failed);
+  copy(location.href, `Link copied. Anyone who opens it sees this ${player.isOpen ? "recording" : "session"}.`);
 });
+
+/** Copies a link. Browsers offer the clipboard only to pages from a secure origin or from this machine. */
+function copy(link: string, done: string): void {
+  const failed = () => notice(link === location.href ? "The link could not be copied. Copy the address of this page instead." : link, 0);
+  if (!isSecureContext) return failed();
+  void navigator.clipboard.writeText(link).then(() => notice(done), failed);
+}
 part("play", HTMLButtonElement).addEventListener("click", () => void play());
 new FileOpener((session, scene) => {
   leave();
@@ -741,15 +770,17 @@ function isStill({ frames, samples, session, speed }: ShownSession): boolean {
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-Object.assign(window, { palpate: pageState(() => shownSession, stage, player, latency, sewing) });
+Object.assign(window, { palpate: pageState(() => shownSession, stage, player, latency, sewing, exercise) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";
 stage.setWireframe(wireframe.checked);
 const first = addressed();
 const asksFor = asked.get("scene");
+const asksForExercise = asked.get("exercise");
 choices.markScene(asksFor ?? "");
 if (first.moment) void open({ moment: first.moment });
 else if (first.sessionId) void open({ sessionId: first.sessionId });
+else if (asksForExercise) void open({ source: forExercise(asksForExercise) });
 else void open(asksFor ? { source: named(asksFor) } : {});
 void choices.fill();

@@ -1,6 +1,7 @@
 // State of the page, for tests and measurements: `window.palpate`.
 
 import { norm, vec } from "palpate";
+import type { ExercisePanel } from "./exercise";
 import type { Latency } from "./latency";
 import { pictureFrom } from "./pictures";
 import type { Player } from "./player";
@@ -11,11 +12,14 @@ import type { Stage } from "./stage";
 import type { ShownSession } from "./session";
 
 /** The page's state as numbers, for tests and measurements. */
-export function pageState(present: () => ShownSession | undefined, stage: Stage, player: Player, latency: Latency, sewing: Sewing) {
+export function pageState(present: () => ShownSession | undefined, stage: Stage, player: Player, latency: Latency, sewing: Sewing, exercise: ExercisePanel) {
   return {
     get frames() {
       const { taken, skipped, newest } = present()?.frames ?? { taken: 0, skipped: 0n };
       return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };
+    },
+    get exercise() {
+      return exercise.state;
     },
     get received() {
       return received.bytes;
@@ -59,6 +63,13 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
       const { session, wound, surface } = present() ?? {};
       const { shown, waiting } = surface?.wound.count ?? { shown: 0, waiting: 0 };
       return { severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting, mostAtOnce: surface?.wound.mostAtOnce ?? 0 };
+    },
+    /** The longest times since the last look that the page has worked on a picture, and on a change of the wound, ms. */
+    takeLongest(): { pictureMs: number; woundMs: number } {
+      const session = present();
+      const longest = { pictureMs: stage.takeLongestMs(), woundMs: session?.longestCutMs ?? 0 };
+      if (session) session.longestCutMs = 0;
+      return longest;
     },
     /** The threads and clips of the session, and how many places are picked for the next one. */
     get sewing() {

@@ -36,10 +36,17 @@ export function addressed(): { sessionId?: string; moment?: JournalName & { step
 /** Writes what is shown to the address, so that reloading and sharing work. */
 function write(values: Record<string, string>, isNew: boolean): void {
   const address = new URL(location.href);
-  for (const key of ["session", "scene", "journal", "run", "step"]) address.searchParams.delete(key);
+  for (const key of ["session", "scene", "exercise", "journal", "run", "step"]) address.searchParams.delete(key);
   for (const [key, value] of Object.entries(values)) address.searchParams.set(key, value);
   if (isNew) history.pushState(null, "", address);
   else history.replaceState(null, "", address);
+}
+
+/** Returns the address of the page with another session. */
+export function withSession(session: string): string {
+  const address = new URL(location.href);
+  address.search = new URLSearchParams({ session }).toString();
+  return address.href;
 }
 
 /** Writes the session to the address. */

@@ -83,6 +83,8 @@ export class ShownSession {
   private readonly mesh: MeshData | undefined;
   /** What blades have cut of the surface, as far as it is known here. */
   wound: Wound;
+  /** The longest time that the page has worked on one change of the wound, ms. */
+  longestCutMs = 0;
   /** The newest version of the topology that the server has told of. */
   private cutVersion = 0;
   private isFollowing = false;
@@ -253,7 +255,9 @@ export class ShownSession {
         // Another refinement has another wound.
         if (surface !== this.surface) continue;
         this.hasFormerWound = false;
+        const begunMs = performance.now();
         surface.wound.take(wound, change);
+        this.longestCutMs = Math.max(this.longestCutMs, performance.now() - begunMs);
         this.told.onCut();
         if (wound.version === version) await sleep(WOUND_MS, signal);
       }

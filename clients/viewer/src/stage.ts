@@ -88,7 +88,9 @@ export class Stage {
   /** Shape of lumps, which are visible through the tissue. */
   private readonly ball = new SphereGeometry(1, 32, 24);
   private readonly lumpy = new MeshBasicMaterial({ color: 0x3d8bff, depthTest: false, transparent: true, opacity: 0.45 });
+  private readonly marked = new MeshBasicMaterial({ color: 0xffb000, depthTest: false, transparent: true, opacity: 0.55 });
   private lumps: Mesh[] = [];
+  private markedBalls: Mesh[] = [];
   private readonly inside = new WoundInside(0x5a0d10, 0);
   private readonly lip = new WoundInside(0x2e0608, 5e-4);
   /** The parts of cut triangles, the tissue between the lips, and the lines along these. */
@@ -114,6 +116,8 @@ export class Stage {
   private before = 0;
   /** Time that the last picture with movement took, ms. */
   private tookMs = 0;
+  /** The longest time that the page has worked on one picture, without the browser's drawing, ms. */
+  private longestMs = 0;
   private readonly effort: Effort;
   private wireframe = false;
   private held = false;
@@ -249,16 +253,27 @@ export class Stage {
 
   /** Shows lumps in the tissue. */
   setLumps(lumps: readonly Lump[]): void {
-    for (const old of this.lumps) this.scene.remove(old);
-    this.lumps = lumps.map(({ centreM, radiusM }) => {
-      const lump = new Mesh(this.ball, this.lumpy);
-      lump.position.set(...centreM);
-      lump.scale.setScalar(radiusM);
-      lump.renderOrder = 1;
-      this.scene.add(lump);
-      return lump;
+    this.lumps = this.exchange(this.lumps, lumps, this.lumpy);
+  }
+
+  /** Shows places that were marked. */
+  setMarks(marks: readonly Lump[]): void {
+    this.markedBalls = this.exchange(this.markedBalls, marks, this.marked);
+  }
+
+  /** Draws balls in place of others. */
+  private exchange(former: readonly Mesh[], balls: readonly Lump[], material: MeshBasicMaterial): Mesh[] {
+    for (const old of former) this.scene.remove(old);
+    const meshes = balls.map(({ centreM, radiusM }) => {
+      const ball = new Mesh(this.ball, material);
+      ball.position.set(...centreM);
+      ball.scale.setScalar(radiusM);
+      ball.renderOrder = 1;
+      this.scene.add(ball);
+      return ball;
     });
     this.draw();
+    return meshes;
   }
 
   /** Shows tools, and this page's own graspers and blades. */
@@ -511,13 +526,22 @@ export class Stage {
     requestAnimationFrame(() => this.drawNow(askedMs));
   }
 
+  /** Returns the longest time that the page has worked on one picture since the last call, ms. */
+  takeLongestMs(): number {
+    const { longestMs } = this;
+    this.longestMs = 0;
+    return longestMs;
+  }
+
   private drawNow(askedMs: number): void {
     this.wanted = false;
     clearTimeout(this.later);
     this.later = undefined;
+    const begunMs = performance.now();
     // The rest of a large wound comes with the next pictures.
     if (this.surface?.refresh()) requestAnimationFrame(() => this.draw());
     this.unseenM += this.surface?.takeMoved() ?? 0;
+    this.longestMs = Math.max(this.longestMs, performance.now() - begunMs);
     if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * (this.surface?.sizeM ?? 1)) {
       this.drawn += 1;
       return;

@@ -140,6 +140,28 @@ async function presses(scene, side) {
   await close();
 }
 
+/** A drag across a tissue, with a blade or with a tip. @param {string} scene @param {string} tool */
+async function drag(scene, tool) {
+  const { page, close } = await open(scene);
+  await page.until(({ drawing }) => drawing.hasTexture);
+  await page.page.check(`input[value=${tool}]`, { force: true });
+  await page.press(0.4, 0.5);
+  await page.until(({ holds, hands }) => holds && hands.both[0]?.touches === true);
+  await sleep(1500);
+  await page.ask(({ takeLongest }) => takeLongest());
+  for (let k = 1; k <= 60; k++) {
+    await page.page.mouse.move(...(await page.at(0.4 + (0.2 * k) / 60, 0.5)));
+    await sleep(50);
+  }
+  await page.page.mouse.up();
+  await page.until(({ wound }) => wound.waiting === 0);
+  const { severed, longest } = await page.ask(({ wound, takeLongest }) => ({ severed: wound.severed, longest: takeLongest() }));
+  const [picture, wound] = [longest.pictureMs.toFixed(1), longest.woundMs.toFixed(1)];
+  console.log(`${tool} across ${scene}: the page worked at most ${picture} ms on a picture, and ${wound} ms on a change of the wound; ${severed} springs severed`);
+  await close();
+}
+
+for (const tool of ["tip", "blade"]) await drag("liver-organ", tool);
 await frames("paper", 31, 0.3);
 await frames("large", 331, 0.03);
 await presses("paper", 31);

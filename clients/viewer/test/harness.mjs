@@ -223,6 +223,8 @@ export class Server {
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
  *   wound: { severed: number, pieces: number, version: number, vertices: number, shown: number, waiting: number, mostAtOnce: number },
  *   sewing: { ties: { number: number, kind: string | undefined, lengthM: number, pathM: number, tensionN: number, broken: boolean }[], picked: number },
+ *   takeLongest: () => { pictureMs: number, woundMs: number },
+ *   exercise: { isShown: boolean, isTrainee: boolean, isBriefing: boolean, isDebriefing: boolean, answers: number, advised: number, finished: boolean, scorePercent: number | undefined },
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>, thumbnail: () => string,
  * }} Inside State that the page exposes for tests (src/main.ts).
  */

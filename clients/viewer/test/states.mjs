@@ -39,6 +39,14 @@ async function pressed(page, tool, x = 0.42, y = 0.5) {
   await page.page.waitForTimeout(2500);
 }
 
+/** A page whose exercise goes on. @param {import("playwright-core").BrowserContext} context */
+async function begun(context) {
+  const page = await shown(context, "?exercise=lumps-2");
+  await page.page.click("#begin-exercise");
+  await pressed(page, "tip");
+  return page;
+}
+
 /** A page without its tissue. @param {import("playwright-core").BrowserContext} context @param {string} url */
 async function bare(context, url) {
   const page = new Page(await context.newPage());
@@ -49,6 +57,24 @@ async function bare(context, url) {
 
 /** @type {Record<string, (context: import("playwright-core").BrowserContext) => Promise<State>>} */
 const STATES = {
+  briefing: async (context) => ({ page: await shown(context, "?exercise=lumps-2") }),
+  exercise: async (context) => ({ page: await begun(context) }),
+  debriefing: async (context) => {
+    const page = await begun(context);
+    await page.page.click("#mark-here");
+    await page.page.mouse.click(...(await page.at(0.42, 0.5)));
+    await page.until(({ exercise }) => exercise.answers === 1);
+    await page.page.click("#finish-exercise");
+    await page.until(({ exercise }) => exercise.isDebriefing);
+    return { page };
+  },
+  trainees: async (context) => {
+    const page = await bare(context, `${server.url}/trainer.html`);
+    await page.page.fill("#trainee", "Ann");
+    await page.page.click("#add button");
+    await page.page.waitForTimeout(2500);
+    return { page };
+  },
   first: async (context) => ({ page: await shown(context, "") }),
   list: async (context) => {
     const page = await shown(context, "");

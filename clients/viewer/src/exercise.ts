@@ -1,0 +1,289 @@
+// The exercise that the shown session is made for: briefing, time, figures, answers and advice, for a trainee and for the trainer.
+//
+// The page asks for the figures once in a while, with a stream that it ends after the first message: without TLS a browser has six
+// connections, and the page's other streams need them (main.ts).
+
+import { type Advice, type ExerciseResult, ExerciseRole, type SessionExercise, SessionState, type WatchExerciseResponse } from "palpate/v1";
+import { Debriefing, hiddenIn, markedIn } from "./debriefing";
+import { figureRow, timeText } from "./figure-text";
+import type { Input } from "./input";
+import type { Lump } from "./lumps";
+import { part } from "./page";
+import { quantity } from "./plot";
+import { CALL_TIMEOUT_MS, describe, exerciseNow, exercises, sessions, sleep } from "./server";
+import type { ShownSession } from "./session";
+import type { Stage } from "./stage";
+import type { Place } from "./surface";
+import { excerpt } from "./text";
+
+/** Interval between two requests for the figures. */
+const ASK_MS = 500;
+/** Radius of a marker of the trainer, as a part of the tissue's size. */
+const MARKER = 0.03;
+
+/** What this module needs of the page. */
+export interface ExerciseHost {
+  present: () => ShownSession | undefined;
+  /** The trainee wants to do the exercise again. */
+  again: () => void;
+  /** Copies the address with which a trainee opens the session. */
+  share: (traineeId: string) => void;
+  notice: (text: string, seconds?: number) => void;
+}
+
+export class ExercisePanel {
+  private readonly briefing = part("briefing", HTMLDialogElement);
+  private readonly mark = part("mark-here", HTMLButtonElement);
+  private readonly size = part("answer-size", HTMLInputElement);
+  private readonly hint = part("hint-text", HTMLInputElement);
+  private readonly pointOut = part("point-out", HTMLButtonElement);
+  private readonly debriefing: Debriefing;
+  private of: ShownSession | undefined;
+  private ended = new AbortController();
+  private answers: Lump[] = [];
+  private markers: Lump[] = [];
+  /** The number of the newest advice that was shown. */
+  private advised = 0;
+  private result: ExerciseResult | undefined;
+
+  constructor(
+    private readonly stage: Stage,
+    private readonly input: Input,
+    private readonly host: ExerciseHost,
+  ) {
+    this.debriefing = new Debriefing(() => host.again());
+    part("begin-exercise", HTMLButtonElement).addEventListener("click", () => void this.begin());
+    this.mark.addEventListener("click", () => this.take(this.mark, (place) => void this.answer(place), "Press where you feel it."));
+    part("finish-exercise", HTMLButtonElement).addEventListener("click", () => void this.finish());
+    part("show-result", HTMLButtonElement).addEventListener("click", () => this.tellResult());
+    part("trainee-link", HTMLButtonElement).addEventListener("click", () => this.exercise && this.host.share(this.exercise.traineeId));
+    this.pointOut.addEventListener("click", () => this.take(this.pointOut, (place) => void this.advise(place), "Press where the trainee is to look."));
+    part("hint-form", HTMLFormElement).addEventListener("submit", (event) => {
+      event.preventDefault();
+      void this.advise();
+    });
+    this.size.addEventListener("input", () => this.tellSize());
+  }
+
+  private get exercise(): SessionExercise | undefined {
+    return this.of?.session.exercise;
+  }
+
+  private get isTrainee(): boolean {
+    return this.exercise?.role === ExerciseRole.TRAINEE;
+  }
+
+  /** The state, for tests. */
+  get state() {
+    return {
+      isShown: !part("exercise", HTMLElement).hidden,
+      isTrainee: this.isTrainee,
+      isBriefing: this.briefing.open,
+      isDebriefing: this.debriefing.isOpen,
+      answers: this.answers.length,
+      advised: this.advised,
+      finished: this.result !== undefined,
+      scorePercent: this.result?.scorePercent,
+    };
+  }
+
+  /** Shows the exercise of a session, if it is made for one. */
+  show(of: ShownSession): void {
+    if (of === this.of) return;
+    this.ended.abort();
+    [this.ended, this.of, this.result] = [new AbortController(), of, undefined];
+    [this.answers, this.markers, this.advised] = [[], [], 0];
+    this.drop();
+    this.debriefing.close();
+    this.briefing.close();
+    this.stage.setMarks([]);
+    const { exercise } = this;
+    part("exercise", HTMLElement).hidden = exercise === undefined;
+    document.body.classList.toggle("trainee", this.isTrainee);
+    if (!exercise?.exercise) return;
+    const { title, name, instructions, hidesTruth } = exercise.exercise;
+    for (const id of ["exercise-title", "briefing-title"]) part(id, HTMLElement).textContent = excerpt(title || name);
+    for (const id of ["exercise-instructions", "briefing-instructions"]) part(id, HTMLElement).textContent = excerpt(instructions);
+    part("briefing-limits", HTMLElement).replaceChildren(...this.limits(exercise));
+    for (const id of ["answer-part", "mark-here"]) part(id, HTMLElement).hidden = !hidesTruth || !this.isTrainee;
+    part("for-trainer", HTMLElement).hidden = this.isTrainee;
+    part("exercise-score-part", HTMLElement).hidden = this.isTrainee;
+    this.tellSize();
+    this.tellTime(0);
+    this.heard();
+    void this.follow(of, this.ended.signal);
+  }
+
+  /** Shows a new status of the session. */
+  heard(): void {
+    const { of, exercise } = this;
+    if (!of || !exercise) return;
+    const waits = of.session.state === SessionState.PAUSED && !exercise.finished;
+    if (waits && this.isTrainee && !this.briefing.open) this.briefing.showModal();
+    if (!waits && this.briefing.open) this.briefing.close();
+    const isOver = exercise.finished || this.result !== undefined;
+    part("finish-exercise", HTMLButtonElement).hidden = isOver || waits;
+    part("show-result", HTMLButtonElement).hidden = this.result === undefined;
+    this.mark.disabled = isOver;
+  }
+
+  private limits({ exercise }: SessionExercise): HTMLElement[] {
+    const rows: [string, string][] = [];
+    if (exercise?.timeLimitS !== undefined) rows.push(["Time", timeText(exercise.timeLimitS)]);
+    if (exercise?.forceLimitN !== undefined) rows.push(["Force", `at most ${quantity(exercise.forceLimitN, "N")}`]);
+    return rows.flatMap(([name, value]) => [
+      Object.assign(document.createElement("dt"), { textContent: name }),
+      Object.assign(document.createElement("dd"), { textContent: value }),
+    ]);
+  }
+
+  private async begin(): Promise<void> {
+    const { of } = this;
+    if (!of) return;
+    try {
+      await sessions.startSession({ sessionId: of.session.sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+      // The next status says so too.
+      of.session.state = SessionState.RUNNING;
+      if (this.of === of) this.heard();
+    } catch (error) {
+      this.host.notice(`The exercise did not begin: ${describe(error)}.`);
+    }
+  }
+
+  /** Asks for the figures until the exercise has ended. */
+  private async follow(of: ShownSession, signal: AbortSignal): Promise<void> {
+    const { sessionId } = of.session;
+    while (!signal.aborted && this.result === undefined) {
+      if (!document.hidden && of.session.state !== SessionState.PAUSED) {
+        try {
+          const told = await exerciseNow(sessionId, signal);
+          if (told && this.of === of) this.tell(told);
+        } catch {
+          // The session's other calls tell what is wrong.
+        }
+      }
+      await sleep(ASK_MS, signal);
+    }
+  }
+
+  private tell({ timeS, figures, scorePercent, advice, result }: WatchExerciseResponse): void {
+    this.tellTime(timeS);
+    const rows = figures.filter(({ tool }) => tool === undefined).map(figureRow);
+    part("exercise-figures", HTMLElement).replaceChildren(
+      ...rows.flatMap(([name, value]) => [
+        Object.assign(document.createElement("dt"), { textContent: name }),
+        Object.assign(document.createElement("dd"), { textContent: value }),
+      ]),
+    );
+    part("exercise-score", HTMLElement).textContent = scorePercent === undefined ? "none" : `${Math.round(scorePercent)} %`;
+    const fresh = advice.filter(({ number }) => number > this.advised);
+    if (fresh.length > 0) this.tellAdvice(advice, fresh);
+    if (result) this.over(result);
+  }
+
+  private tellTime(timeS: number): void {
+    const limitS = this.exercise?.exercise?.timeLimitS;
+    part("exercise-time", HTMLElement).textContent = timeText(timeS) + (limitS === undefined ? "" : ` of ${timeText(limitS)}`);
+  }
+
+  private tellAdvice(all: readonly Advice[], fresh: readonly Advice[]): void {
+    this.advised = Math.max(...fresh.map(({ number }) => number));
+    const text = fresh.at(-1)?.text ?? "";
+    const line = part("exercise-advice", HTMLElement);
+    if (text !== "") {
+      line.textContent = excerpt(text);
+      line.hidden = false;
+    }
+    if (this.isTrainee) this.host.notice(text === "" ? "Your trainer points at a place." : `Your trainer: ${excerpt(text)}`, 10);
+    const radiusM = MARKER * (this.of?.surface.sizeM ?? 0);
+    this.markers = all.flatMap(({ placeM }) => (placeM ? [{ centreM: [placeM.x, placeM.y, placeM.z] as const, radiusM }] : []));
+    this.draw();
+  }
+
+  private tellSize(): void {
+    part("answer-size-value", HTMLOutputElement).value = `${this.size.value} mm`;
+  }
+
+  /** With the next press on the tissue, `act` gets its place, unless the button is pressed again. */
+  private take(button: HTMLButtonElement, act: (place: Place) => void, what: string): void {
+    const begins = button.getAttribute("aria-pressed") !== "true";
+    this.drop();
+    if (!begins) return;
+    button.setAttribute("aria-pressed", "true");
+    this.input.onPlace = (place) => {
+      this.drop();
+      act(place);
+    };
+    part("view", HTMLElement).scrollIntoView({ block: "nearest" });
+    this.host.notice(what, 0);
+  }
+
+  /** Presses touch again. */
+  private drop(): void {
+    for (const button of [this.mark, this.pointOut]) {
+      if (button.getAttribute("aria-pressed") !== "true") continue;
+      button.setAttribute("aria-pressed", "false");
+      this.input.onPlace = undefined;
+      this.host.notice("", 0);
+    }
+  }
+
+  private async answer({ restM }: Place): Promise<void> {
+    const { of } = this;
+    if (!of) return;
+    const [x, y, z] = restM;
+    const diameterM = Number(this.size.value) / 1000;
+    if (!(await of.hand.tool.mark({ placeM: { x, y, z }, diameterM })) || this.of !== of) return;
+    this.answers = [...this.answers, { centreM: restM, radiusM: diameterM / 2 }];
+    part("answers", HTMLElement).textContent = `${this.answers.length} marked`;
+    this.draw();
+  }
+
+  private async advise(place?: Place): Promise<void> {
+    const { of } = this;
+    const text = this.hint.value.trim();
+    if (!of || (text === "" && !place)) return;
+    const [x, y, z] = place?.restM ?? [0, 0, 0];
+    try {
+      await exercises.adviseTrainee({ sessionId: of.session.sessionId, text, placeM: place && { x, y, z } }, { timeoutMs: CALL_TIMEOUT_MS });
+      this.hint.value = "";
+    } catch (error) {
+      this.host.notice(`It was not sent: ${describe(error)}.`);
+    }
+  }
+
+  private async finish(): Promise<void> {
+    const { of } = this;
+    if (!of) return;
+    this.drop();
+    try {
+      await of.hands.letGo();
+      const { result } = await exercises.finishExercise({ sessionId: of.session.sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+      if (result && this.of === of) this.over(result);
+    } catch (error) {
+      this.host.notice(`The exercise did not end: ${describe(error)}.`);
+    }
+  }
+
+  private over(result: ExerciseResult): void {
+    if (this.result) return;
+    this.result = result;
+    this.drop();
+    this.draw();
+    this.heard();
+    this.tellResult();
+  }
+
+  private tellResult(): void {
+    const { exercise } = this.exercise ?? {};
+    if (this.result) this.debriefing.show(excerpt(exercise?.title || exercise?.name || ""), this.result);
+  }
+
+  /** Draws answers and markers on the tissue, and what was hidden once that is told. */
+  private draw(): void {
+    const { result } = this;
+    // A trainer sees the lumps of the scene.
+    if (result && this.isTrainee) this.stage.setLumps(hiddenIn(result));
+    this.stage.setMarks([...(result?.isTold ? markedIn(result) : this.answers), ...this.markers]);
+  }
+}
