@@ -75,6 +75,7 @@ impl LabelMap<'_> {
         if self.axes.determinant() < 0.0 {
             triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
         }
+        smooth_surface::even_out(&mut vertices, &triangles);
         smooth_surface::fit_volume(&mut vertices, &triangles, volume * extent.voxels as f64);
         vertices.iter().try_for_each(|at| draft.vertex(at.to_array()))?;
         triangles.iter().try_for_each(|triangle| draft.polygon(&triangle.map(i64::from), &[], &[]))?;

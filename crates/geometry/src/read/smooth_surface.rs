@@ -31,9 +31,15 @@ const LEVELS: usize = 1 << 12;
 /// A part that is nearer to the level than this counts as inside, so that vertices around it are not at one place.
 const NEAREST: f32 = 1e-3;
 
+/// Times that vertices are moved to their neighbours.
+const EVENINGS: usize = 2;
+
 /// Most times that a surface is moved to its volume, and the relative error of the volume at which it is there.
 const MAX_FITS: usize = 16;
 const FITTED: f64 = 1e-6;
+
+/// Longest way of vertices at once, as a part of the edge of a cube with the volume.
+const MAX_STEP: f64 = 0.2;
 
 /// Cells around a label.
 pub(super) struct PartGrid {
@@ -150,6 +156,24 @@ fn crossings(distances: &[f32], sides: [usize; 3]) -> usize {
     strides.into_iter().map(differs).sum()
 }
 
+/// Moves each vertex halfway to the mean of its neighbours, [`EVENINGS`] times: where the surface passes a cell's middle closely,
+/// triangles have almost no area.
+pub(super) fn even_out(vertices: &mut [DVec3], triangles: &[[u32; 3]]) {
+    for _ in 0..EVENINGS {
+        // Of a closed surface each neighbour counts twice.
+        let mut sums = vec![(DVec3::ZERO, 0.0); vertices.len()];
+        for [a, b, c] in triangles.iter().map(|corners| corners.map(|corner| corner as usize)) {
+            for (own, one, other) in [(a, b, c), (b, c, a), (c, a, b)] {
+                sums[own].0 += vertices[one] + vertices[other];
+                sums[own].1 += 2.0;
+            }
+        }
+        for (vertex, (sum, count)) in vertices.iter_mut().zip(sums).filter(|(_, (_, count))| *count > 0.0) {
+            *vertex = 0.5 * (*vertex + sum / count);
+        }
+    }
+}
+
 /// Moves the vertices along their normals until the surface encloses a volume.
 pub(super) fn fit_volume(vertices: &mut [DVec3], triangles: &[[u32; 3]], volume: f64) {
     for _ in 0..MAX_FITS {
@@ -168,6 +192,9 @@ pub(super) fn fit_volume(vertices: &mut [DVec3], triangles: &[[u32; 3]], volume:
         if !step.is_finite() || missing.abs() < FITTED * volume {
             return;
         }
+        // What is small would be moved too far.
+        let most = MAX_STEP * volume.cbrt();
+        let step = step.clamp(-most, most);
         vertices.iter_mut().zip(&normals).for_each(|(vertex, normal)| *vertex += step * normal.normalize_or_zero());
     }
 }
