@@ -17,7 +17,7 @@ XTASK := PYTHON='$(PYTHON)' NODE='$(NODE)' NPM='$(NPM)' $(CARGO) xtask
 PACKAGES := deb wheel npm crates library image helm unity unreal
 
 .PHONY: help run fetched-crates programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-observe test-python bench-python test-arm build-windows test-windows check-macos test-asan test-valgrind test-debug test-mutants need-arm need-windows need-cross stress stress-cuts libfuzzer lint packages $(PACKAGES:%=package-%) picture figures screenshot page-states film scene-pictures bench-roundtrip bench-duty \
-	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-solid bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-solid bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet trainees soak siege fuzz need-rust \
 	need-python chaos site
 
 help:
@@ -80,6 +80,7 @@ help:
 	@echo '                     one attack alone: make bench-load ATTACK=endless-scene'
 	@echo 'make bench-fleet     a fleet compared with one server, and the capacity of etcd: docs/benchmarks/fleet.md;'
 	@echo '                     one part alone: ARGUMENTS=calls (or spread, steps, etcd)'
+	@echo 'make trainees        simulated trainees of three exercises, TRAINEE_SEEDS=20 truths each: what their scores tell (an hour)'
 	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for; then'
 	@echo '                     clients and servers killed KILLS=50 times'
 	@echo 'make siege           eight attackers at random against four honest clients for SECONDS=1800, by SEED=16: their times,'
@@ -388,6 +389,11 @@ bench-python: build $(VENV)/ready
 	$(INSTALL_PYTHON)
 	$(VENV)/bin/python clients/python/benches/run.py
 	$(VENV)/bin/python clients/python/benches/study.py
+
+# How well the score of an exercise tells kinds of trainees apart: so many truths of each level.
+TRAINEE_SEEDS ?= 20
+trainees: need-rust
+	PALPATE_TRAINEE_SEEDS=$(TRAINEE_SEEDS) $(CARGO) test --release --workspace --test server -- trainees:: --nocapture
 
 # How long, s.
 SECONDS ?= 1800

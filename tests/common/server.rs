@@ -114,6 +114,15 @@ impl TestServer {
         TestServer::start_at("127.0.0.1:0", arguments)
     }
 
+    /// Starts a server that gives heavy work, such as the tissue of an exercise, all the time that it takes on a busy machine. `config` is
+    /// added to its configuration, before the limits; `folder` takes the file.
+    pub fn start_patiently(folder: &Path, config: &str, limits: &str) -> Self {
+        let file = folder.join("server.toml");
+        let text = format!("datagrams = false\n{config}\n[limits]\nwork_s = 300.0\n{limits}\n");
+        std::fs::write(&file, text).unwrap();
+        TestServer::start(&["--config", file.to_str().unwrap()])
+    }
+
     /// Starts a server at that address.
     pub fn start_at(listen: &str, arguments: &[&str]) -> Self {
         let mut command = Command::new(server_program());

@@ -115,7 +115,8 @@ fn scored((text, json): &(String, Value)) -> BTreeSet<(String, Option<u32>, u64)
 #[tokio::test]
 async fn live_figures_the_result_and_the_journal_have_equal_bits_and_a_trainee_is_told_what_it_may_know() {
     let folder = tempfile::tempdir().unwrap();
-    let server = TestServer::start(&["--journal", folder.path().to_str().unwrap()]);
+    let journals = folder.path().join("journals");
+    let server = TestServer::start_patiently(folder.path(), &format!("journal = {journals:?}"), "");
     let (session, trainee_id) = created(&server, Some(7)).await;
     let (by_trainer, by_trainee) = (watch(&server, &session.session_id).await, watch(&server, &trainee_id).await);
     let [by_trainer, by_trainee] = [by_trainer, by_trainee].map(|watched| tokio::spawn(all(watched)));
@@ -152,7 +153,7 @@ async fn live_figures_the_result_and_the_journal_have_equal_bits_and_a_trainee_i
         "NOT_FOR_TRAINEE"
     );
     sessions.delete_session(delete).await.unwrap();
-    let journal = folder.path().join(format!("{}.1.mcap", session.session_id));
+    let journal = journals.join(format!("{}.1.mcap", session.session_id));
     let replayed = score(&journal, &[]).unwrap();
     assert_eq!(scored(&replayed), bits(&result.figures));
     let (_, json) = &replayed;
@@ -170,7 +171,8 @@ async fn live_figures_the_result_and_the_journal_have_equal_bits_and_a_trainee_i
 
 #[tokio::test]
 async fn a_trainee_gets_no_call_that_shows_the_truth_and_a_trainer_advises() {
-    let server = TestServer::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let server = TestServer::start_patiently(folder.path(), "", "");
     let (session, trainee_id) = created(&server, None).await;
     let exercise = session.exercise.clone().unwrap();
     assert!(exercise.seed.is_some_and(|seed| seed < 1 << 53) && exercise.role() == pb::ExerciseRole::Trainer);
@@ -246,7 +248,8 @@ async fn a_trainee_gets_no_call_that_shows_the_truth_and_a_trainer_advises() {
 
 #[tokio::test]
 async fn an_exercise_of_a_client_is_read_and_what_is_wrong_is_named() {
-    let server = TestServer::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let server = TestServer::start_patiently(folder.path(), "", "");
     let text = |more: &str| {
         let text = format!(
             "name = \"mine\"\ninstructions = \"Press.\"\nscenes = [\"phantom\"]\ntime_limit_s = 0.3\n{more}\n\

@@ -20,6 +20,7 @@ mod common {
     pub mod metrics;
     pub mod proxy;
     pub mod random;
+    pub mod raw_codec;
     pub mod server;
 }
 
@@ -30,6 +31,7 @@ mod budget;
 mod datagrams;
 mod devices;
 mod etcd;
+mod exercise_bytes;
 mod exercises;
 mod fleet;
 mod fleet_chaos;
@@ -51,6 +53,7 @@ mod replay;
 mod sessions;
 mod soak;
 mod stall;
+mod trainees;
 mod views;
 mod watching;
 mod zero_server;

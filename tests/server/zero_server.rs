@@ -3,58 +3,18 @@
 
 use std::path::Path;
 
+use crate::common::raw_codec::RawBytes;
 use crate::common::server::{self, TestServer};
 use palpate_proto::pb;
 use palpate_tissue::limits::Limits;
 use prost::Message;
-use tonic::Status;
-use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
-
-/// Messages as bytes.
-#[derive(Default)]
-struct Bytes;
-
-impl Codec for Bytes {
-    type Encode = Vec<u8>;
-    type Decode = Vec<u8>;
-    type Encoder = Bytes;
-    type Decoder = Bytes;
-
-    fn encoder(&mut self) -> Bytes {
-        Bytes
-    }
-
-    fn decoder(&mut self) -> Bytes {
-        Bytes
-    }
-}
-
-impl Encoder for Bytes {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn encode(&mut self, item: Vec<u8>, to: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        bytes::BufMut::put_slice(to, &item);
-        Ok(())
-    }
-}
-
-impl Decoder for Bytes {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn decode(&mut self, from: &mut DecodeBuf<'_>) -> Result<Option<Vec<u8>>, Status> {
-        let length = bytes::Buf::remaining(from);
-        Ok(Some(bytes::Buf::copy_to_bytes(from, length).to_vec()))
-    }
-}
 
 /// Calls a method of a service with bytes.
 async fn call(server: &TestServer, method: &'static str, request: Vec<u8>) -> Vec<u8> {
     let mut client = tonic::client::Grpc::new(server.channel().await);
     client.ready().await.unwrap();
     let path = http::uri::PathAndQuery::from_static(method);
-    client.unary(tonic::Request::new(request), path, Bytes).await.unwrap().into_inner()
+    client.unary(tonic::Request::new(request), path, RawBytes).await.unwrap().into_inner()
 }
 
 /// A field that holds a message, or bytes.
