@@ -419,13 +419,22 @@ fn request_seeds() -> Vec<Vec<u8>> {
         })),
         ..Default::default()
     });
-    let upload = pb::UploadMeshRequest {
-        file_name: "organ.obj".into(),
-        part: b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n".to_vec(),
+    let upload = |(file_name, part): (&str, &[u8])| pb::UploadMeshRequest {
+        file_name: file_name.into(),
+        part: part.to_vec(),
         last: true,
         unit: "mm".into(),
         ..Default::default()
     };
+    let uploads: [(&str, &[u8]); 4] = [
+        ("organ.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"),
+        ("organ.inp", b"*NODE\n1\n2,1\n3,0,1\n4,0,0,1\n*ELEMENT,TYPE=C3D4,ELSET=a\n1,1,2,3,4\n"),
+        (
+            "organ.mesh",
+            b"MeshVersionFormatted 2\nDimension 3\nVertices 4\n0 0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\nTetrahedra 1\n1 2 3 4 5\nEnd\n",
+        ),
+        ("organ.nrrd", b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\x01\x01\x01\x01\0\0\0\0"),
+    ];
     let vertices = pb::probe_request::Where::Vertices(pb::Vertices { vertices: vec![2, 0] });
     let watch = pb::WatchSamplesRequest { deadband: Some(deadband), heartbeat_s: Some(1.0), ..Default::default() };
     let points = pb::probe_request::Where::Points(pb::GridPoints { points: vec![point] });
@@ -442,7 +451,6 @@ fn request_seeds() -> Vec<Vec<u8>> {
             "CreateSessionRequest",
             pb::CreateSessionRequest { source: Some(of_material), ..Default::default() }.encode_to_vec(),
         ),
-        ("UploadMeshRequest", upload.encode_to_vec()),
         ("ProbeRequest", pb::ProbeRequest { r#where: Some(vertices), ..Default::default() }.encode_to_vec()),
         (
             "SendCommandsRequest",
@@ -474,6 +482,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         ),
         ("GetStateHashRequest", pb::GetStateHashRequest { at_step: Some(9), ..Default::default() }.encode_to_vec()),
     ];
+    seeds.extend(uploads.map(|file| ("UploadMeshRequest", upload(file).encode_to_vec())));
     for command in commands {
         seeds.push(("TouchRequest", touch(pb::touch_request::Message::Command(command))));
     }

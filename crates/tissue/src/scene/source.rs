@@ -145,3 +145,49 @@ fn made(item: &Item<'_>, limits: &Limits) -> Result<TriangleMesh> {
         Ok(mesh)
     })
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use crate::limits::Limits;
+    use crate::scene::Scene;
+
+    /// A scan of 12 × 10 × 10 voxels with the label 3 in the middle 8 × 6 × 6.
+    fn scan() -> Vec<u8> {
+        let mut file = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 12 10 10\nencoding: raw\n\n".to_vec();
+        let is_inner = |n: usize| {
+            [(n % 12, 12), (n / 12 % 10, 10), (n / 120, 10)].iter().all(|(at, side)| (2..side - 2).contains(at))
+        };
+        file.extend((0..1200).map(|n| u8::from(is_inner(n)) * 3));
+        file
+    }
+
+    fn solid(keys: &str) -> Result<f64, String> {
+        let text = format!(
+            "name = \"a\"\n[solid]\nfile = \"scan.nrrd\"\n{keys}\ncells = 500\nfixed = \"none\"\n\
+             foundation_n_per_m3 = 2e4\n[material]\nyoungs_modulus_pa = 8e3\npoissons_ratio = 0.45\n"
+        );
+        let scene = Scene::parse_given("scene", &text, ("scan.nrrd", &scan()), &Limits::default());
+        let mesh = scene.map_err(|refusal| refusal.to_string())?.body.kind().mesh().unwrap();
+        Ok(palpate_geometry::report::volume(&mesh.vertices_m, &mesh.triangles))
+    }
+
+    #[test]
+    fn a_label_of_a_scan_is_a_solid_in_millimetres_unless_the_scene_says_another_unit() {
+        // 288 voxels.
+        for (keys, volume_m3) in
+            [("label = 3", 288e-9), ("label = 3\nunit = \"cm\"", 288e-6), ("unit = \"mm\"", 288e-9)]
+        {
+            let found = solid(keys).unwrap();
+            assert!((found / volume_m3 - 1.0).abs() < 1e-3, "{keys}: {found}");
+        }
+        for (keys, says) in [
+            ("label = 2", "solid.file: scan.nrrd: no voxel has the label 2: there are 3"),
+            ("label = \"liver\"", "solid.label: must be a whole number"),
+            ("", "solid.unit: is missing"),
+        ] {
+            let refusal = solid(keys).unwrap_err();
+            assert!(refusal.contains(says), "{refusal}");
+        }
+    }
+}
