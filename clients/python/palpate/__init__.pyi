@@ -378,6 +378,18 @@ class Frames(Iterator[Frame]):
 
     def __next__(self) -> Frame: ...
 
+class Measures(Iterator[dict[str, Any]]):
+    """The measures of a session's exercise, one moment after another, ten per second of simulated time. Each is a dictionary:
+
+    - `step`: steps done; `time_s`: simulated time since the exercise began.
+    - `figures`: the figures of all tools together, by the name of the measure; `tools`: those of each tool, by its number.
+    - `score_percent`: the score if it ended now; None for a trainee.
+    - `advice`: what the trainer has told since the moment before: `number`, `text`, `place_m` of a marker.
+    - `result`: what `RemoteSession.finish_exercise` returns, once the exercise has ended; the iteration ends then.
+    """
+
+    def __next__(self) -> dict[str, Any]: ...
+
 class RemoteSession:
     """A session on a server. `with` deletes it at the end. In a fleet, calls and streams follow it to the server that has it.
     """
@@ -490,6 +502,18 @@ class RemoteSession:
         strength_n: Optional[float] = None,
     ) -> None:
         """Closes clip `number` on two places, as `Session.clip` does; acquires the tool first if needed."""
+    def mark(self, tool: int, place_m: Vector, *, diameter_m: Optional[float] = None) -> None:
+        """Marks a place of the surface, m, as `Session.mark` does; acquires the tool first if needed."""
+    def exercise(self) -> Optional[dict[str, Any]]:
+        """Returns the exercise that the session is made for: `exercise` (like `Client.exercises`), `role` ("trainer" or "trainee"),
+        `begin_step`, `finished`, and for a trainer `trainee_id` and `seed`; None for any other session."""
+    def measures(self) -> Measures:
+        """Watches the measures of the session's exercise from now on, until it ends."""
+    def finish_exercise(self) -> dict[str, Any]:
+        """Ends the session's exercise, unless it has ended, and returns its result: `figures`, `tools`, `score_percent`, `criteria`, the
+        hidden `lumps`, the `answers`, `step` and `time_s`. A trainee gets step and time alone if the exercise says so (`is_told`)."""
+    def advise(self, text: str = "", *, place_m: Optional[Vector] = None) -> None:
+        """Sends the trainee a hint (a text), or a marker at a place of the surface at rest, m. For trainers."""
     def untie(self, tool: int, number: int) -> None:
         """Cuts a thread or clip, and takes it out; acquires the tool first if needed."""
     def release(self, tool: int) -> None:
@@ -513,6 +537,20 @@ class Client:
     ) -> RemoteSession:
         """Creates a session of one of the server's scenes, by its name, or of a scene of yours. The server deletes it when
         nobody uses it for `idle_timeout_s`."""
+    def exercises(self) -> list[dict[str, Any]]:
+        """Returns the server's exercises: name, title, instructions, scenes, limits, and what a trainee is told."""
+    def create_exercise(
+        self,
+        exercise: str,
+        *,
+        seed: Optional[int] = None,
+        scene: Optional[str] = None,
+        paused: bool = False,
+        idle_timeout_s: Optional[float] = None,
+    ) -> RemoteSession:
+        """Creates a session for an exercise, by its name, or for one of yours, by its text (TOML). Without a seed, the server draws the
+        hidden truth from one that it does not tell trainees. The session is the trainer's; `exercise()["trainee_id"]` is the id for
+        `session` that opens it for a trainee."""
     def load(
         self, plan: Union[Source, dict[str, Any]], *, report: Optional[Union[str, PathLike[str]]] = None
     ) -> dict[str, Any]:

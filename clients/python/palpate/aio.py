@@ -6,10 +6,10 @@
             ...
 """
 
-from ._native import Frames, RemoteSession, Samples
+from ._native import Frames, Measures, RemoteSession, Samples
 from ._native import Server as Client
 
-__all__ = ["Client", "Frames", "RemoteSession", "Samples", "connect"]
+__all__ = ["Client", "Frames", "Measures", "RemoteSession", "Samples", "connect"]
 
 
 def connect(url, *, token=None, ca=None, tls_name=None, cert=None, key=None, within_s=10.0):

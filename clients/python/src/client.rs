@@ -14,6 +14,7 @@ use palpate_session::journal;
 use palpate_tissue::scene;
 use palpate_tissue::shape::PointName;
 use pb::command::Action;
+use pb::exercise_service_client::ExerciseServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::view_service_client::ViewServiceClient;
 use pyo3::prelude::*;
@@ -22,6 +23,7 @@ use tokio::sync::{Mutex, oneshot};
 use crate::arrays::vector;
 use crate::device::Given;
 use crate::error::{of_client, of_status, refused, wrong};
+use crate::exercise::{self, KnownExercise, LiveMeasures, SessionTask, ToldResult};
 use crate::hand::Hand;
 use crate::instrument::Instrument;
 use crate::load::load;
@@ -150,6 +152,38 @@ impl Server {
                     Ok(RemoteSession::of(session, own, awaited))
                 }
             }
+        })
+    }
+
+    /// Returns the server's exercises: name, title, instructions, scenes, limits, and what a trainee is told.
+    fn exercises<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let mut exercises = ExerciseServiceClient::new(self.channel.clone());
+        answer(py, self.awaited, async move {
+            let found = exercises.list_exercises(pb::ListExercisesRequest {}).await.map_err(of_status)?;
+            Ok(found.into_inner().exercises.into_iter().map(KnownExercise::of).collect::<Vec<_>>())
+        })
+    }
+
+    /// Creates a session for an exercise, by its name, or for one of yours, by its text (TOML). Without a seed, the server draws the
+    /// hidden truth from one that it does not tell trainees. The session is the trainer's; `exercise()["trainee_id"]` is the id for
+    /// `session` that opens it for a trainee.
+    #[pyo3(signature = (exercise, *, seed=None, scene=None, paused=false, idle_timeout_s=None))]
+    fn create_exercise<'py>(
+        &self,
+        py: Python<'py>,
+        exercise: String,
+        seed: Option<u64>,
+        scene: Option<String>,
+        paused: bool,
+        idle_timeout_s: Option<f64>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (server, awaited) = (self.clone(), self.awaited);
+        let source = Some(exercise::source(exercise, seed, scene));
+        answer(py, awaited, async move {
+            let request = pb::CreateSessionRequest { source, paused, idle_timeout_s };
+            let made = server.sessions().create_session(request).await.map_err(of_status)?.into_inner().session;
+            let session = Followed::new(server.server, server.channel, made.unwrap_or_default().session_id);
+            Ok(RemoteSession::of(session, None, awaited))
         })
     }
 
@@ -574,6 +608,66 @@ impl RemoteSession {
         let clip = pb::Clip { bites: bites(&bites_m, radius_m)?, strength_n };
         let laid = self.held.clone().clip(tool, number, clip);
         answer(py, self.awaited, async move { laid.await.map(|()| NOTHING).map_err(of_client) })
+    }
+
+    /// Marks a place of the surface, m, as `Session.mark` does; acquires the tool first if needed.
+    #[pyo3(signature = (tool, place_m, *, diameter_m=None))]
+    fn mark<'py>(
+        &self,
+        py: Python<'py>,
+        tool: u32,
+        place_m: &Bound<'py, PyAny>,
+        diameter_m: Option<f64>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let place_m = Some(numbers(vector("place_m", place_m)?));
+        self.tell(py, tool, Action::Mark(pb::Mark { place_m, diameter_m }))
+    }
+
+    /// Returns the exercise that the session is made for: `exercise` (like `Client.exercises`), `role` ("trainer" or "trainee"),
+    /// `begin_step`, `finished`, and for a trainer `trainee_id` and `seed`; None for any other session.
+    fn exercise<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let (session, session_id) = self.own();
+        answer(py, self.awaited, async move {
+            let found = called!(session, SessionServiceClient.get_session(pb::GetSessionRequest { session_id }))?;
+            Ok(found.session.and_then(|session| session.exercise).map(SessionTask::of))
+        })
+    }
+
+    /// Watches the measures of the session's exercise from now on, until it ends.
+    fn measures<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let ((session, session_id), awaited) = (self.own(), self.awaited);
+        answer(py, awaited, async move {
+            let request = pb::WatchExerciseRequest { session_id };
+            let stream = called!(session, ExerciseServiceClient.watch_exercise(request))?;
+            Ok(LiveMeasures { stream: Arc::new(Mutex::new(stream)), awaited })
+        })
+    }
+
+    /// Ends the session's exercise, unless it has ended, and returns its result: `figures`, `tools`, `score_percent`, `criteria`, the
+    /// hidden `lumps`, the `answers`, `step` and `time_s`. A trainee gets step and time alone if the exercise says so (`is_told`).
+    fn finish_exercise<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let (session, session_id) = self.own();
+        answer(py, self.awaited, async move {
+            let request = pb::FinishExerciseRequest { session_id };
+            let finished = called!(session, ExerciseServiceClient.finish_exercise(request))?;
+            Ok(ToldResult::of(finished.result.unwrap_or_default()))
+        })
+    }
+
+    /// Sends the trainee a hint (a text), or a marker at a place of the surface at rest, m. For trainers.
+    #[pyo3(signature = (text="", *, place_m=None))]
+    fn advise<'py>(
+        &self,
+        py: Python<'py>,
+        text: &str,
+        place_m: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (session, session_id) = self.own();
+        let place_m = place_m.map(|place_m| vector("place_m", place_m)).transpose()?.map(numbers);
+        let request = pb::AdviseTraineeRequest { session_id, text: text.to_owned(), place_m };
+        answer(py, self.awaited, async move {
+            called!(session, ExerciseServiceClient.advise_trainee(request)).map(|_| NOTHING)
+        })
     }
 
     /// Cuts a thread or clip, and takes it out; acquires the tool first if needed.

@@ -15,6 +15,7 @@ mod client;
 mod device;
 mod ending;
 mod error;
+mod exercise;
 mod fit;
 mod hand;
 mod instrument;
@@ -50,6 +51,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<offline::Offline>()?;
     module.add_class::<streams::Samples>()?;
     module.add_class::<streams::FrameStream>()?;
+    module.add_class::<exercise::LiveMeasures>()?;
     module.add_function(wrap_pyfunction!(scene::scenes, module)?)?;
     module.add_function(wrap_pyfunction!(scene::scripts, module)?)?;
     module.add_function(wrap_pyfunction!(fit::fit, module)?)?;

@@ -317,6 +317,38 @@ class Clients(Served, unittest.TestCase):
         with self.assertRaises(ConnectionError):
             palpate.connect("http://127.0.0.1:1", within_s=2.0)
 
+    def test_a_trainee_does_an_exercise_and_both_see_its_result(self):
+        server = palpate.connect(self.url)
+        self.assertIn("lumps-1", [exercise["name"] for exercise in server.exercises()])
+        with server.create_exercise("lumps-1", seed=7) as session:
+            told = session.exercise()
+            self.assertEqual((told["role"], told["seed"], told["finished"]), ("trainer", 7, False))
+            trainee = server.session(told["trainee_id"])
+            known = trainee.exercise()
+            self.assertEqual((known["role"], known["seed"], known["trainee_id"]), ("trainee", None, None))
+            with self.assertRaises(palpate.Refused) as raised:
+                trainee.save()
+            self.assertEqual(raised.exception.reason, "NOT_FOR_TRAINEE")
+            session.advise("press deeper", place_m=(0.01, 0.0, 0.04))
+            live, seen = session.measures(), trainee.measures()
+            self.assertEqual(next(seen)["advice"], [{"number": 1, "text": "press deeper", "place_m": (0.01, 0.0, 0.04)}])
+            for height_mm in range(43, 34, -1):
+                trainee.pose(0, (0.01, 0.0, 1e-3 * height_mm), palpate.Tip(radius_m=0.008))
+            trainee.mark(0, (0.01, 0.0, 0.04))
+            trainee.release(0)
+            result = trainee.finish_exercise()
+            moments = list(live)
+            self.assertEqual((moments[-1]["result"], moments[-1]["figures"]), (result, result["figures"]))
+            self.assertGreater(result["tools"][0]["peak_force_n"], 0.1)
+            self.assertEqual((len(result["answers"]), result["answers"][0]["place_m"]), (1, (0.01, 0.0, 0.04)))
+            self.assertTrue(result["is_told"] and result["lumps"] and 0.0 <= result["score_percent"] <= 100.0)
+            self.assertNotIn("hits", list(seen)[-1]["figures"])
+        with server.create_session("paper") as session:
+            self.assertIsNone(session.exercise())
+            with self.assertRaises(palpate.Refused) as raised:
+                session.finish_exercise()
+            self.assertEqual(raised.exception.reason, "UNKNOWN_EXERCISE")
+
 
 class Awaiting(Served, unittest.IsolatedAsyncioTestCase):
     async def test_several_sessions_are_touched_and_watched_at_once(self):

@@ -52,7 +52,11 @@ impl Copying {
         instrument: Instrument,
     ) -> Self {
         let is_grid = session.scene.as_ref().is_some_and(|scene| palpate_proto::scene::grid(scene).is_some());
-        let copier = copier.filter(|copier| !is_grid || copier.copies.of_grids).cloned();
+        // A trainee gets no copy of a tissue in which something is hidden.
+        let is_hidden = session.exercise.as_ref().is_some_and(|of| {
+            of.role() == pb::ExerciseRole::Trainee && of.exercise.as_ref().is_some_and(|exercise| exercise.hides_truth)
+        });
+        let copier = copier.filter(|copier| !is_hidden && (!is_grid || copier.copies.of_grids)).cloned();
         Copying { channel, session_id: session.session_id.clone(), instrument, copier, under_way: JoinSet::new() }
     }
 
