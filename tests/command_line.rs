@@ -316,7 +316,10 @@ fn measured(sets: &[&str]) -> String {
     let limits = palpate_tissue::limits::Limits::default();
     let forces_n = press.forces_n(&model, &limits, &std::sync::atomic::AtomicBool::new(false)).unwrap();
     let mut text = "# a machine in a cellar\nTime (ms),Depth (mm),Force (mN)\n".to_owned();
-    for ((time_s, depth_m), force_n) in press.time_s.iter().zip(&press.depth_m).zip(&forces_n) {
+    for (k, force_n) in forces_n.iter().enumerate() {
+        // A noise of 2 % of the largest force.
+        let noise_n = if k % 2 == 0 { 0.02 } else { -0.02 } * forces_n[50];
+        let [time_s, depth_m, force_n] = [press.time_s[k], press.depth_m[k], force_n + noise_n];
         writeln!(text, "{},{},{}", 1e3 * time_s, 1e3 * depth_m, 1e3 * force_n).unwrap();
     }
     text
@@ -351,7 +354,7 @@ fn a_fit_gives_back_the_stiffness_and_writes_a_scene_that_has_it() {
     }
     let scene = palpate_tissue::scene::Scene::load(&at("fitted.toml"), &[], &palpate_tissue::limits::Limits::default());
     let found = scene.unwrap().anchor_stiffness_n_per_m;
-    assert!((found / 5.0 - 1.0).abs() < 0.01, "{found}");
+    assert!((found / 5.0 - 1.0).abs() < 0.02, "{found}");
     assert!(std::fs::read_to_string(at("fit.svg")).unwrap().contains("<polyline"));
     let (status, text) = fit(&["--json", "--threads", "1"]);
     let told: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -211,14 +211,16 @@ impl Fitter<'_> {
     /// Runs all curves with other values of the parameters. `None` where the tissue can't be stepped, or does not bear the presses.
     fn predict(&mut self, active: &[Active], places: &[Vec<f64>]) -> Result<Vec<Option<Vec<f64>>>, SimulationFailure> {
         let FitOptions { threads, limits, stop, .. } = *self.options;
-        let scenes = places.iter().map(|x| self.scene_at(active, x)).collect::<Result<Vec<Scene>, _>>()?;
+        // A value that no tissue has, such as the time of a branch below a millisecond, has no forces.
+        let scenes: Vec<Option<Scene>> = places.iter().map(|x| self.scene_at(active, x).ok()).collect();
         let most = self.model.plan.substeps.saturating_mul(MAX_SLOWER).min(limits.substeps);
         let narrower = Limits { substeps: most, ..limits.clone() };
-        let compile = |number: usize| self.model.compile_alike(&scenes[number], &narrower);
+        let compile = |number: usize| scenes[number].as_ref().map(|scene| self.model.compile_alike(scene, &narrower));
         let models = in_parallel(threads, scenes.len(), compile, || {});
         let models = models.into_iter().map(|model| match model {
-            Some(Err(refusal)) if refusal.reason == Reason::TooLarge => Ok(None),
-            Some(model) => model.map(Some),
+            Some(None) => Ok(None),
+            Some(Some(Err(refusal))) if [Reason::TooLarge, Reason::OutOfRange].contains(&refusal.reason) => Ok(None),
+            Some(Some(model)) => model.map(Some),
             None => Err(no_threads()),
         });
         let models = models.collect::<Result<Vec<Option<Arc<Model>>>, Refusal>>()?;
@@ -326,7 +328,7 @@ impl Fitter<'_> {
     }
 
     fn minimum(&mut self, active: &[Active]) -> Result<(Minimum, Uncertainty), SimulationFailure> {
-        let steps: Vec<f64> = active.iter().map(|active| active.scale.step()).collect();
+        let steps: Vec<[f64; 2]> = active.iter().map(|active| active.scale.step(active.parameter)).collect();
         let measured = self.measured.clone();
         let lengths: Vec<usize> = self.curves.iter().map(|curve| curve.force_n.len()).collect();
         let found = minimize(&measured, &steps, &mut |places: &[Vec<f64>]| self.predict(active, places))?;

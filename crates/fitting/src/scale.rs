@@ -37,12 +37,18 @@ impl Scale {
         }
     }
 
-    /// Returns the number by which a search differentiates: toward the softer tissue, which takes no more substeps.
-    pub fn step(&self) -> f64 {
-        match self {
-            Scale::Logarithm(_) => -0.01,
-            Scale::Poisson(_) => -0.05,
-        }
+    /// Returns the difference of x by which a search differentiates a parameter, toward the softer tissue, which takes no more
+    /// substeps; and what the difference of the forces is divided by. Forces are nearly proportional to a value that is above 0, or
+    /// linear in it: then d/dx is the difference divided by eʰ − 1, however large the step h is. It is large where a parameter adds
+    /// little to the force, so that the difference does not drown in the errors of runs.
+    pub fn step(&self, parameter: TissueParameter) -> [f64; 2] {
+        let step = match (self, parameter) {
+            (Scale::Poisson(_), _) => return [-0.1; 2],
+            (_, TissueParameter::BranchTime(_)) => return [-0.2; 2],
+            _ if parameter.adds_by_motion() => -0.5,
+            _ => -0.03,
+        };
+        [step, f64::exp_m1(step)]
     }
 
     /// Returns whether an interval of the values is too wide to say anything: more than a factor of two up and down, and of

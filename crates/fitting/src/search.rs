@@ -7,7 +7,7 @@ use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
 /// The part of a standard error below which a step no longer matters: of N samples, it changes the sum of squares by its square
 /// divided by N.
-const NEAR: f64 = 0.1;
+const NEAR: f64 = 0.03;
 
 /// The relative change of the numbers below which the search ends.
 const XTOL: f64 = 1e-4;
@@ -40,7 +40,7 @@ struct Problem<'p, 'm, E> {
     measured: &'m [f64],
     /// The square root of the sum of its squares: residuals are relative to it.
     norm: f64,
-    steps: &'m [f64],
+    steps: &'m [[f64; 2]],
     x: DVector<f64>,
     predicted: Option<Vec<f64>>,
     predict: RefCell<&'m mut Predict<'p, E>>,
@@ -63,17 +63,17 @@ impl<E> Problem<'_, '_, E> {
     /// Returns the derivatives at the present place by differences; 0 where there is no value beside it.
     fn derivatives(&self) -> Option<DMatrix<f64>> {
         let here = self.predicted.as_ref()?;
-        let beside = |(number, step): (usize, &f64)| {
+        let beside = |(number, [step, _]): (usize, &[f64; 2])| {
             let mut place = self.x.as_slice().to_vec();
             place[number] += step;
             place
         };
         let values = self.call(&self.steps.iter().enumerate().map(beside).collect::<Vec<_>>());
         let mut jacobian = DMatrix::zeros(here.len(), self.steps.len());
-        for (number, (value, step)) in values.iter().zip(self.steps).enumerate() {
+        for (number, (value, [_, divisor])) in values.iter().zip(self.steps).enumerate() {
             let Some(value) = value else { continue };
             for (row, (beside, here)) in value.iter().zip(here).enumerate() {
-                jacobian[(row, number)] = (beside - here) / step;
+                jacobian[(row, number)] = (beside - here) / divisor;
             }
         }
         *self.newest.borrow_mut() = Some((self.x.clone(), jacobian.clone()));
@@ -87,6 +87,10 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
     type ParameterStorage = Owned<f64, Dyn>;
 
     fn set_params(&mut self, x: &DVector<f64>) {
+        // The search looks again where it came from.
+        if self.predicted.is_some() && self.x == *x {
+            return;
+        }
         self.x.copy_from(x);
         self.predicted = self.call(&[x.as_slice().to_vec()]).pop().flatten();
     }
@@ -114,12 +118,16 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
 }
 
 /// Searches from 0 on for the numbers with the least sum of squares of `predict` − `measured`, which is not 0 throughout. `steps` are
-/// the differences by which it differentiates, one for each number. Without numbers it evaluates once. `None` if the function has no
+/// the difference by which it differentiates each number, and what it divides the difference of the function by. Without numbers it evaluates once. `None` if the function has no
 /// value at 0.
 ///
 /// # Errors
 /// Returns the error of `predict`.
-pub(crate) fn minimize<E>(measured: &[f64], steps: &[f64], predict: &mut Predict<'_, E>) -> Result<Option<Minimum>, E> {
+pub(crate) fn minimize<E>(
+    measured: &[f64],
+    steps: &[[f64; 2]],
+    predict: &mut Predict<'_, E>,
+) -> Result<Option<Minimum>, E> {
     let norm = measured.iter().map(|value| value * value).sum::<f64>().sqrt();
     let mut problem = Problem {
         measured,
@@ -166,7 +174,7 @@ mod tests {
             evaluations += places.len();
             Ok::<_, ()>(places.iter().map(|x| (x[0] < 3.0).then(|| curve(x))).collect())
         };
-        let found = minimize(&curve(&[2.5, -0.7]), &[-0.01, -0.01], &mut predict).unwrap().unwrap();
+        let found = minimize(&curve(&[2.5, -0.7]), &[[-0.01; 2]; 2], &mut predict).unwrap().unwrap();
         assert!(found.converged);
         assert!((found.x[0] - 2.5).abs() < 1e-3 && (found.x[1] + 0.7).abs() < 1e-3, "{:?}", found.x);
         assert!(evaluations < 60, "{evaluations}");

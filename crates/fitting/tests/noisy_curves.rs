@@ -33,12 +33,12 @@ fn ramp(shape: TipShape, radius_m: f64, depth_m: f64, [into_s, holds_s, every_s]
     ImposedPress { place_m: None, shape, radius_m, time_s, depth_m }
 }
 
-/// A press that vibrates about a depth, from 0 to twice that.
+/// A press to a depth in 0.05 s, about which the tip then vibrates by a fifth of it, without leaving the tissue.
 fn vibration(shape: TipShape, radius_m: f64, depth_m: f64, frequency_hz: f64, lasts_s: f64) -> ImposedPress {
-    let samples = (lasts_s * 200.0).round() as usize;
-    let time_s: Vec<f64> = (0..=samples).map(|k| 0.005 * k as f64).collect();
-    let turn = |time_s: &f64| (std::f64::consts::TAU * frequency_hz * time_s).cos();
-    let depth_m = time_s.iter().map(|time_s| depth_m * (1.0 - turn(time_s))).collect();
+    let samples = (lasts_s * 1000.0).round() as usize;
+    let time_s: Vec<f64> = (0..=samples).map(|k| 0.001 * k as f64).collect();
+    let turn = |time_s: f64| (std::f64::consts::TAU * frequency_hz * (time_s - 0.05).max(0.0)).sin();
+    let depth_m = time_s.iter().map(|time_s| depth_m * ((time_s / 0.05).min(1.0) + 0.2 * turn(*time_s))).collect();
     ImposedPress { place_m: None, shape, radius_m, time_s, depth_m }
 }
 
@@ -95,6 +95,7 @@ impl Case {
             for (index, found) in fit.parameters.iter().enumerate() {
                 let truth = found.parameter.value(&self.truth).unwrap();
                 let [low, high] = found.interval;
+                println!("{what} {seed} {index} {} {}", found.value / truth, low <= truth && truth <= high);
                 within[index] += u32::from(low <= truth && truth <= high);
                 worst[index] = worst[index].max((found.value / truth - 1.0).abs());
                 width[index] = width[index].max((high - low) / 2.0 / truth);
@@ -125,23 +126,35 @@ impl Case {
 
 use TissueParameter as P;
 
+fn at_the_root() {
+    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
+}
+
 /// A liver under two tips, slowly and with vibration.
 fn sheet() -> Case {
-    let truth = scene("liver", &[]);
+    let truth = scene("liver", &["stepping.tolerance=1e-5"]);
     let presses = vec![
-        ramp(TipShape::Disc, 0.005, 0.008, [0.5, 0.0, 0.005]),
-        ramp(TipShape::Disc, 0.015, 0.008, [0.5, 0.0, 0.005]),
-        vibration(TipShape::Disc, 0.010, 0.002, 20.0, 0.5),
+        ramp(TipShape::Disc, 0.005, 0.008, [0.1, 0.0, 0.001]),
+        ramp(TipShape::Disc, 0.015, 0.008, [0.1, 0.0, 0.001]),
+        vibration(TipShape::Disc, 0.010, 0.002, 20.0, 0.15),
     ];
     Case::new(truth, presses, &[(P::SpringStiffness, 0.4), (P::AnchorStiffness, 2.0), (P::Damping, 3.0)])
 }
 
 fn surface() -> Case {
-    let truth = scene("gallbladder", &["mesh.organ.edge_m=0.0035"]);
+    let truth = scene(
+        "gallbladder",
+        &[
+            "mesh.organ.edge_m=0.0035",
+            "material.youngs_modulus_pa=200e3",
+            "material.foundation_n_per_m3=2e5",
+            "stepping.tolerance=1e-4",
+        ],
+    );
     let presses = vec![
-        ramp(TipShape::Disc, 0.003, 0.009, [0.5, 0.0, 0.005]),
-        ramp(TipShape::Disc, 0.009, 0.006, [0.5, 0.0, 0.005]),
-        vibration(TipShape::Disc, 0.006, 0.001, 20.0, 0.5),
+        ramp(TipShape::Disc, 0.005, 0.003, [0.1, 0.0, 0.001]),
+        ramp(TipShape::Disc, 0.010, 0.004, [0.1, 0.0, 0.001]),
+        vibration(TipShape::Disc, 0.006, 0.001, 20.0, 0.15),
     ];
     Case::new(truth, presses, &[(P::YoungsModulus, 0.4), (P::Foundation, 2.0), (P::DampingRatio, 2.0)])
 }
@@ -149,28 +162,55 @@ fn surface() -> Case {
 fn solid(cell: &str) -> Case {
     let truth = scene("phantom", &[cell, "material.viscosity_pa_s=5.0"]);
     let presses = vec![
-        ramp(TipShape::RigidDisc, 0.008, 0.003, [0.5, 0.0, 0.005]),
-        ramp(TipShape::RigidDisc, 0.025, 0.004, [0.5, 0.0, 0.005]),
-        vibration(TipShape::RigidDisc, 0.012, 0.001, 20.0, 0.5),
+        ramp(TipShape::RigidDisc, 0.008, 0.003, [0.1, 0.0, 0.001]),
+        ramp(TipShape::RigidDisc, 0.025, 0.006, [0.1, 0.0, 0.001]),
+        vibration(TipShape::RigidDisc, 0.012, 0.001, 20.0, 0.15),
     ];
     Case::new(truth, presses, &[(P::YoungsModulus, 0.3), (P::PoissonsRatio, 0.7), (P::Viscosity, 0.05)])
 }
 
 #[test]
 fn a_sheet_a_surface_and_a_solid_are_given_back_within_their_intervals() {
-    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
-    for (what, case) in [("sheet", sheet()), ("surface", surface()), ("solid", solid("solid.cell_m=0.013"))] {
-        case.recover(what, 1);
+    at_the_root();
+    for (what, case) in [("surface", surface()), ("sheet", sheet()), ("solid", solid("solid.cell_m=0.013"))] {
+        let (share, error) = case.recover(what, 1);
+        assert!(share == 1.0 && error < 0.05, "{what}: {share}, {error}");
     }
 }
 
+/// Fits 50 noises, and checks that the intervals are right as often as they say.
+fn recovered(what: &str, case: &Case) {
+    let (share, error) = case.recover(what, 50);
+    assert!(share >= 0.9 && error < 0.03, "{what}: {share}, {error}");
+}
+
 #[test]
-#[ignore = "takes some minutes"]
-fn fifty_noises_are_within_the_intervals_as_often_as_these_say() {
-    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
-    for (what, case) in [("sheet", sheet()), ("surface", surface()), ("solid", solid("solid.cell_m=0.01"))] {
-        let (share, error) = case.recover(what, 50);
-        assert!(share >= 0.9 && error < 0.03, "{what}: {share}, {error}");
-    }
-    solid("solid.cell_m=0.0055").recover("solid of 3,000 cells", 1);
+#[ignore = "takes minutes"]
+fn fifty_noises_of_a_sheet_are_within_the_intervals_as_often_as_these_say() {
+    at_the_root();
+    recovered("sheet", &sheet());
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn fifty_noises_of_a_surface_are_within_the_intervals_as_often_as_these_say() {
+    at_the_root();
+    recovered("surface", &surface());
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn fifty_noises_of_a_solid_are_within_the_intervals_as_often_as_these_say() {
+    at_the_root();
+    recovered("solid", &solid("solid.cell_m=0.013"));
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn a_solid_of_3000_cells_is_given_back_in_a_minute() {
+    at_the_root();
+    let case = solid("solid.cell_m=0.0055");
+    println!("{:?} cells", case.truth.body.kind().cells());
+    let (share, error) = case.recover("solid of 3,000 cells", 1);
+    assert!(share == 1.0 && error < 0.03, "{share}, {error}");
 }
