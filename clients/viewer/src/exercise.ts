@@ -10,7 +10,7 @@ import type { Input } from "./input";
 import type { Lump } from "./lumps";
 import { part } from "./page";
 import { quantity } from "./plot";
-import { CALL_TIMEOUT_MS, describe, exerciseNow, exercises, sessions, sleep } from "./server";
+import { CALL_TIMEOUT_MS, describe, exerciseNow, exercises, isGone, sessions, sleep } from "./server";
 import type { ShownSession } from "./session";
 import type { Stage } from "./stage";
 import type { Place } from "./surface";
@@ -97,6 +97,9 @@ export class ExercisePanel {
     this.debriefing.close();
     this.briefing.close();
     this.stage.setMarks([]);
+    for (const id of ["answers", "exercise-figures"]) part(id, HTMLElement).replaceChildren();
+    part("exercise-advice", HTMLElement).hidden = true;
+    part("exercise-score", HTMLElement).textContent = "none";
     const { exercise } = this;
     part("exercise", HTMLElement).hidden = exercise === undefined;
     document.body.classList.toggle("trainee", this.isTrainee);
@@ -154,12 +157,14 @@ export class ExercisePanel {
   private async follow(of: ShownSession, signal: AbortSignal): Promise<void> {
     const { sessionId } = of.session;
     while (!signal.aborted && this.result === undefined) {
-      if (!document.hidden && of.session.state !== SessionState.PAUSED) {
+      const { state, exercise } = of.session;
+      if (!document.hidden && (state !== SessionState.PAUSED || exercise?.finished)) {
         try {
           const told = await exerciseNow(sessionId, signal);
           if (told && this.of === of) this.tell(told);
-        } catch {
+        } catch (error) {
           // The session's other calls tell what is wrong.
+          if (isGone(error)) return;
         }
       }
       await sleep(ASK_MS, signal);
@@ -188,7 +193,8 @@ export class ExercisePanel {
 
   private tellAdvice(all: readonly Advice[], fresh: readonly Advice[]): void {
     this.advised = Math.max(...fresh.map(({ number }) => number));
-    const text = fresh.at(-1)?.text ?? "";
+    // A marker without a text may have come after a hint.
+    const text = fresh.filter((advice) => advice.text !== "").at(-1)?.text ?? "";
     const line = part("exercise-advice", HTMLElement);
     if (text !== "") {
       line.textContent = excerpt(text);

@@ -217,7 +217,7 @@ async function open(target: Target): Promise<void> {
   }
 }
 
-/** Creates a session. Who chooses an exercise does it: the page goes on with the trainee's ID, and forgets the trainer's. */
+/** Creates a session. Who chooses an exercise does it: the page goes on with the trainee's ID. */
 async function create(source: Source): Promise<Session | undefined> {
   const isExercise = source.case === "exercise";
   const { session } = await sessions.createSession({ source, paused: isExercise, idleTimeoutS: IDLE_S }, {});

@@ -13,7 +13,9 @@ const KEPT = "palpate-trainees";
 const MAX_TRAINEES = 40;
 /** Interval between two rounds of requests. */
 const ASK_MS = 1000;
-/** A session ends after this time without requests: this page asks, so a trainee may open the link later. */
+/** The same while the page is hidden. */
+const HIDDEN_MS = 60_000;
+/** A session ends after this time without requests: this page asks, also while it is hidden, so a trainee may open the link later. */
 const IDLE_S = 900;
 /** The measures that are shown beside the score, if the exercise has them. */
 const SHOWN = ["peak_force_n", "mean_force_n", "coverage_share", "path_length_m", "hits", "false_alarms"];
@@ -42,7 +44,11 @@ let trainees = kept();
 const rows = new Map<string, Row>();
 
 function keep(): void {
-  localStorage.setItem(KEPT, JSON.stringify(trainees));
+  try {
+    localStorage.setItem(KEPT, JSON.stringify(trainees));
+  } catch {
+    say("This browser keeps nothing: the list is gone once the page is closed.");
+  }
   part("empty", HTMLElement).hidden = trainees.length > 0;
 }
 
@@ -93,7 +99,7 @@ class Row {
       const { session } = await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
       if (!session) return;
       this.isOver = session.exercise?.finished ?? false;
-      if (session.state === SessionState.PAUSED) return this.tell(session);
+      if (session.state === SessionState.PAUSED && !this.isOver) return this.tell(session);
       const told = await exerciseNow(sessionId);
       if (told) this.tell(session, told);
     } catch (error) {
@@ -176,6 +182,13 @@ part("add", HTMLFormElement).addEventListener("submit", (event) => {
   void add();
 });
 
+/** Ends the wait for the next round when the page is hidden, or seen again. */
+let wake = new AbortController();
+document.addEventListener("visibilitychange", () => {
+  wake.abort();
+  wake = new AbortController();
+});
+
 /** Fills the list of exercises. */
 async function list(): Promise<void> {
   try {
@@ -190,7 +203,6 @@ for (const trainee of trainees) show(trainee);
 keep();
 await list();
 for (;;) {
-  const due = document.hidden ? [] : [...rows.values()].filter(({ isOver }) => !isOver);
-  for (const row of due) await row.ask();
-  await sleep(ASK_MS);
+  for (const row of [...rows.values()].filter(({ isOver }) => !isOver)) await row.ask();
+  await sleep(document.hidden ? HIDDEN_MS : ASK_MS, wake.signal);
 }
