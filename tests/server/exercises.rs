@@ -287,3 +287,36 @@ async fn an_exercise_of_a_client_is_read_and_what_is_wrong_is_named() {
     let watched = exercises(&server).await.watch_exercise(pb::WatchExerciseRequest { session_id: paper }).await;
     assert_eq!(told(&watched.err().unwrap()).1, "UNKNOWN_EXERCISE");
 }
+
+#[tokio::test]
+async fn after_a_crash_a_session_has_its_exercise_its_ids_and_its_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = format!("journal = {:?}", folder.path().join("journals"));
+    let server = TestServer::start_patiently(folder.path(), &config, "");
+    let (session, trainee_id) = created(&server, Some(3)).await;
+    let session_id = session.session_id;
+    press_and_mark(&server, &trainee_id).await;
+    let result = finish(&server, &session_id).await;
+    let until_durable = async {
+        // The result is noted after its step.
+        let reached = server.status(&session_id).await.step;
+        while server.status(&session_id).await.journal.unwrap().durable_step.is_none_or(|step| step <= reached) {
+            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        }
+    };
+    // Steps of a tissue that moves are written at once.
+    let (_, ()) =
+        tokio::time::timeout(TEST_TIMEOUT, async { tokio::join!(press_and_mark(&server, &trainee_id), until_durable) })
+            .await
+            .unwrap();
+    drop(server);
+    let server = TestServer::start_patiently(folder.path(), &config, "");
+    let seen = server.status(&trainee_id).await;
+    assert!(seen.scene.unwrap().inclusions.is_empty() && seen.exercise.unwrap().finished);
+    let save = server.sessions().await.save_snapshot(pb::SaveSnapshotRequest { session_id: trainee_id.clone() }).await;
+    assert_eq!(told(&save.err().unwrap()).1, "NOT_FOR_TRAINEE");
+    let told_again = finish(&server, &session_id).await;
+    assert_eq!((told_again.step, bits(&told_again.figures)), (result.step, bits(&result.figures)));
+    assert_eq!((told_again.score_percent, told_again.lumps), (result.score_percent, result.lumps));
+    assert_eq!(server.status(&session_id).await.exercise.unwrap().seed, Some(3));
+}

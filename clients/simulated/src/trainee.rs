@@ -124,7 +124,7 @@ pub async fn do_exercise(
     let open = pb::TouchOpen {
         session_id: trainee_id.to_owned(),
         tools: vec![0],
-        lease_s: Some(10.0),
+        lease_s: Some(60.0),
         holder: "simulated trainee".to_owned(),
         sample_every_steps: Some(2),
         ..Default::default()

@@ -329,7 +329,7 @@ impl Pacer {
             until_step: until,
             after_run,
             revision,
-            exercise: exercise.as_ref().map(|live| live.chosen.recorded(&live.trainee_id)),
+            exercise: exercise.as_ref().map(|live| (live.chosen.clone(), live.trainee_id.clone())),
         };
         // A playback is already recorded.
         let event_log =

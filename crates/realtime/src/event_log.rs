@@ -14,8 +14,8 @@ use tokio::sync::watch;
 
 use super::clock::now_ns;
 use super::inbox::Leaving;
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::input::{Felt, Input};
-use palpate_session::journal::pb::RecordedExercise;
 use palpate_session::snapshot::Saved;
 use palpate_tissue::lock::lock;
 use palpate_tissue::{Model, ReadCopy};
@@ -153,8 +153,8 @@ pub struct About {
     pub after_run: u64,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
-    /// The exercise that the session is made for, as its journal has it; `None` for any other session.
-    pub exercise: Option<RecordedExercise>,
+    /// The exercise that the session is made for, with the ID that opens the session for a trainee; `None` for any other session.
+    pub exercise: Option<(ChosenExercise, String)>,
 }
 
 /// Event log of one session: the events that its journal does not have yet, and which steps are on disk. The stepping

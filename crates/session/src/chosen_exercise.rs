@@ -1,8 +1,7 @@
-//! An exercise with the hidden truth that was drawn for a session, and how a journal keeps both.
+//! An exercise with the hidden truth that was drawn for a session.
 
 use std::sync::Arc;
 
-use palpate_proto::journal as pb;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::scene::exercise::{Exercise, Lump};
 
@@ -38,23 +37,6 @@ impl ChosenExercise {
     /// Returns the assignments by which a scene gets the hidden lumps.
     pub fn assignments(&self) -> Vec<String> {
         self.exercise.assignments(&self.lumps)
-    }
-
-    /// Returns the exercise as the header of a journal has it; `trainee_id` is the ID that opens the session for a trainee.
-    pub fn recorded(&self, trainee_id: &str) -> pb::RecordedExercise {
-        pb::RecordedExercise { text: self.text.to_string(), seed: self.seed, trainee_id: trainee_id.to_owned() }
-    }
-
-    /// Returns the exercise in the header of a journal; `None` if the session was not made for one. `place` names the journal.
-    ///
-    /// # Errors
-    /// Refuses a text or a seed that [`ChosenExercise::new`] refuses.
-    pub fn from_header(place: &str, header: &pb::Header) -> Result<Option<Self>> {
-        let read = |recorded: &pb::RecordedExercise| {
-            let read = ChosenExercise::new("exercise", &recorded.text, Some(recorded.seed));
-            read.map_err(|refusal| Refusal { place: Some(place.to_owned()), ..refusal.within("exercise") })
-        };
-        header.exercise.as_ref().map(read).transpose()
     }
 
     /// Refuses an exercise or a seed that another one contradicts, which is that of the journal `place`.

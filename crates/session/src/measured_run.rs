@@ -4,8 +4,7 @@ use crate::Session;
 use crate::chosen_exercise::ChosenExercise;
 use crate::exercise_judge::{ExerciseJudge, ExerciseScore};
 use crate::measure_recorder::MeasureRecorder;
-use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, Measures, register};
-use palpate_proto::journal as pb;
+use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, Measures};
 use palpate_refusal::Result;
 use palpate_tissue::Model;
 use palpate_tissue::scene::script::Script;
@@ -115,19 +114,6 @@ impl MeasuredRun {
             judged: self.judge.as_ref().map(|judge| (judge.clone(), judge.truth(session))),
             rate_hz: session.model().scene.stepping.rate_hz,
         }
-    }
-}
-
-impl MomentFigures {
-    /// Returns the result in a journal, with the score in percent and without its criteria. Figures of measures that this program does not
-    /// have are left out.
-    pub fn recorded(result: &pb::ExerciseResult) -> Self {
-        let figure = |figure: &pb::Figure| {
-            let definition = register::find(&figure.measure)?;
-            Some(Figure { definition, value: figure.value, tool: figure.tool })
-        };
-        let score = result.score_percent.map(|percent| ExerciseScore { percent, criteria: Vec::new() });
-        MomentFigures { step: result.step, figures: result.figures.iter().filter_map(figure).collect(), score }
     }
 }
 

@@ -8,6 +8,7 @@ use palpate_proto::journal as pb;
 use palpate_refusal::Refusal;
 use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, thresholds};
+use palpate_session::journal::exercise::from_header;
 use palpate_session::{RecordedMark, Session};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
@@ -49,7 +50,7 @@ impl ExerciseOptions {
     /// that of the journal.
     pub(crate) fn recorded(&self, place: &str, header: &pb::Header) -> Result<Option<ChosenExercise>, Refusal> {
         let given = self.chosen()?;
-        let Some(recorded) = ChosenExercise::from_header(place, header)? else { return Ok(given) };
+        let Some(recorded) = from_header(place, header)? else { return Ok(given) };
         if let Some(given) = given {
             // Without --seed, the seed is not given.
             let seed = self.seed.unwrap_or(recorded.seed);

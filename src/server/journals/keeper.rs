@@ -274,7 +274,7 @@ impl Keeper {
             running,
             until_step,
             ownership_revision: *revision,
-            exercise: exercise.clone(),
+            exercise: exercise.as_ref().map(|(chosen, trainee_id)| journal::exercise::recorded(chosen, trainee_id)),
         };
         let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
         let writer = JournalWriter::new(&opening, unix_ns()).signed(self.key.as_ref());

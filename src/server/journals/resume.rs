@@ -12,7 +12,6 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::journal::file::JournalFile;
 use palpate_session::journal::{self, JournalReader, Replay, Resumed, Survey, pb};
-use palpate_session::measured_run::MomentFigures;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::scheme_selection::NEVER;
@@ -155,7 +154,7 @@ fn exercise(
 ) -> Result<SessionExercise> {
     let plain = pacer.plain_of(&chosen, &resumed.first, &NEVER)?;
     let trainee_id = resumed.header.exercise.as_ref().map(|exercise| exercise.trainee_id.clone()).unwrap_or_default();
-    let figures = ended.map(|result| Arc::new(MomentFigures::recorded(result)));
+    let figures = ended.map(|result| Arc::new(journal::exercise::from_result(result)));
     let ended = figures.map(|figures| EndedExercise { figures, answers: Vec::new() });
     Ok(SessionExercise { chosen, trainee_id, plain, ended })
 }
@@ -167,7 +166,7 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
         return Ok(ResumeOutcome::Ended);
     }
     let until_step = survey.until_step;
-    let chosen = ChosenExercise::from_header(reader.place(), reader.header())?;
+    let chosen = journal::exercise::from_header(reader.place(), reader.header())?;
     let ended = if chosen.is_some() { reader.exercise_result()? } else { None };
     let mut resumed = Replay::near(reader, survey, limits, until_step)?.resume()?;
     let begin = Begin {

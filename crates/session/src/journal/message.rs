@@ -5,16 +5,15 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate_exercise::Figure;
 use palpate_geometry::{Group, TriangleMesh, VolumeRegion};
 use palpate_haptics::{Coupling, Tip, TipShape};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::journal as pb;
 
+use super::exercise;
 use super::format::REPLAYS;
 use crate::command::{Command, Due};
 use crate::input::{Felt, Input};
-use crate::measured_run::MomentFigures;
 use crate::rules::Rules;
 use crate::wire::required;
 use crate::wire::scene::{from_scene, sent, set_absent_viscosity};
@@ -246,19 +245,9 @@ pub(super) fn input(step: u64, input: &Input, tips: &mut Tips) -> pb::Input {
         Input::DroppedSteps(steps) => What::DroppedSteps(pb::DroppedSteps { steps: *steps }),
         Input::Revive => What::Revive(pb::Revive {}),
         Input::Hold(reason) => What::Hold(pb::Hold { reason: reason.clone() }),
-        Input::ExerciseEnded(figures) => What::ExerciseResult(exercise_result(figures)),
+        Input::ExerciseEnded(figures) => What::ExerciseResult(exercise::result(figures)),
     };
     pb::Input { step, what: Some(what) }
-}
-
-fn exercise_result(MomentFigures { step, figures, score }: &MomentFigures) -> pb::ExerciseResult {
-    let figure = |figure: &Figure| pb::Figure {
-        measure: figure.definition.name.to_owned(),
-        value: figure.value,
-        tool: figure.tool,
-    };
-    let score_percent = score.as_ref().map(|score| score.percent);
-    pb::ExerciseResult { step: *step, figures: figures.iter().map(figure).collect(), score_percent }
 }
 
 fn command(due: &Due, tips: &mut Tips) -> pb::Command {

@@ -24,6 +24,7 @@
 //! Records are parsed by the crate `mcap`. Its writer keeps an index of every chunk in memory, and its output open;
 //! so journals are written record by record ([`records`]), and indexed when they are complete ([`seal`]).
 
+pub mod exercise;
 pub mod file;
 pub mod format;
 pub mod foxglove;

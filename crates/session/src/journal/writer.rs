@@ -32,7 +32,7 @@ pub struct Opening<'a> {
     pub until_step: Option<u64>,
     /// Revision in etcd at which the server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
-    /// The exercise that the session is made for ([`ChosenExercise::recorded`](crate::chosen_exercise::ChosenExercise::recorded)).
+    /// The exercise that the session is made for ([`exercise::recorded`](super::exercise::recorded)); `None` for any other session.
     pub exercise: Option<pb::RecordedExercise>,
 }
 
