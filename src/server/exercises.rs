@@ -14,7 +14,7 @@ use palpate_refusal::{Reason, Refusal};
 use palpate_session::budget::Account;
 use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::{Body, Scene};
 use tokio::sync::watch;
 use tonic::{Request, Response, Status};
 use tracing::info;
@@ -66,6 +66,13 @@ pub(super) fn chosen(
     }
     let scene_name = if request.scene_name.is_empty() { &chosen.exercise.scenes[0] } else { &request.scene_name };
     let scene = catalog.load(scene_name, &chosen.assignments(), limits)?;
+    if let Body::Solid(solid) = &scene.body
+        && chosen.exercise.hides_truth()
+        && !solid.gravity().is_at_rest()
+    {
+        let message = "hides lumps in a solid that sags as the session begins, which would show them: set `loaded = true` in its [gravity]";
+        return Err(Refusal::new(Reason::WrongKind, "scene_name", message));
+    }
     Ok((chosen, scene))
 }
 

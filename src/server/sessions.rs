@@ -20,7 +20,7 @@ use super::meshes;
 use super::services::Services;
 use super::status;
 use super::stream_termination::until_cut;
-use super::trainee::unlisted;
+use super::trainee::{is_authenticated, unlisted};
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::{SessionHandle, SessionReservation, StreamKind};
 use palpate_refusal::{Reason, Refusal, number};
@@ -133,9 +133,17 @@ impl SessionService for Sessions {
             return Err(refusal.into());
         }
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let may_see_hidden = is_authenticated(request.extensions());
         let request = request.into_inner();
         if self.0.fleet.is_some() {
             exercises::check_no_fleet(&request)?;
+        }
+        if let Some(pb::create_session_request::Source::Journal(moment)) = &request.source
+            && !may_see_hidden
+        {
+            let (recorded, payer, moment) = (self.0.recorded.clone(), account.clone(), moment.clone());
+            let check = move |_: &CancelFlag| recorded.check_hides_nothing(&moment, &payer);
+            self.0.job_pool.work(&account, check).await??;
         }
         if let Some(fleet) = &self.0.fleet
             && let Some(created) = fleet.create_elsewhere(&request, &account).await
@@ -297,6 +305,11 @@ impl SessionService for Sessions {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let handle = self.0.session(&request.session_id).await?;
+        if handle.exercise.is_some() {
+            // What a trainee is told of the tissue is that of the beginning.
+            let message = "is made for an exercise, whose tissue stays as it is";
+            return Err(Refusal::new(Reason::WrongKind, "session_id", message).into());
+        }
         let (change, to_change, pacer) = (wire::scene::from_change(&request), handle.clone(), self.0.pacer.clone());
         let change =
             move |cancel: &CancelFlag| pacer.change_tissue(&to_change, &change, request.at_step, cancel.flag());

@@ -104,8 +104,21 @@ pub(super) fn not_for_trainee() -> Refusal {
 /// Returns the exercise of a session whose own ID a list must not tell: without authentication everybody may ask for the list, trainees
 /// too.
 pub(super) fn unlisted<'h>(handle: &'h SessionHandle, extensions: &Extensions) -> Option<&'h Arc<LiveExercise>> {
-    let is_authenticated = extensions.get::<Tenure>().is_some();
-    handle.exercise.as_ref().filter(|exercise| !is_authenticated && exercise.chosen.exercise.hides_truth())
+    let hides = |exercise: &&Arc<LiveExercise>| exercise.chosen.exercise.hides_truth();
+    handle.exercise.as_ref().filter(hides).filter(|_| !is_authenticated(extensions))
+}
+
+/// Returns whether the server knows who has made a call.
+pub(super) fn is_authenticated(extensions: &Extensions) -> bool {
+    extensions.get::<Tenure>().is_some()
+}
+
+/// Returns the refusal to play, for a caller whom the server does not know, what an exercise hides: everybody may ask for the list of
+/// sessions, and so for the scene of the new one.
+pub(super) fn shows_hidden() -> Refusal {
+    let message = "is of an exercise, and shows what it hides to everybody: that needs a server with tokens (docs/security.md), or the \
+                   journal's file and `palpate journal`";
+    Refusal::new(Reason::NotForTrainee, "session_id", message)
 }
 
 #[cfg(test)]

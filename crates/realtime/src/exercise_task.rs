@@ -99,7 +99,8 @@ impl ExerciseTask {
         if std::mem::replace(&mut self.is_over, true) {
             return;
         }
-        let (moment, answers): (MeasuredMoment, _) = (self.run.end(session).clone(), session.marks().to_vec());
+        let (moment, answers): (MeasuredMoment, _) =
+            (self.run.end(session).clone(), self.run.answers(session).to_vec());
         let inbox = inbox.clone();
         let work = move || {
             let ended = EndedExercise { figures: Arc::new(moment.figures()), answers };

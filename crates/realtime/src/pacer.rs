@@ -170,7 +170,12 @@ impl Pacer {
     /// Returns the refusals of [`Pacer::get`] for that session.
     pub fn get_for_trainee(&self, trainee_id: &str) -> Option<Result<Arc<SessionHandle>>> {
         let id = lock(&self.trainees).get(trainee_id).cloned()?;
-        Some(self.get(&id))
+        // A refusal names the ID that was sent.
+        let of_trainee = |refusal: Refusal| match refusal.reason {
+            Reason::UnknownSession => unknown_session(trainee_id),
+            _ => refusal,
+        };
+        Some(self.get(&id).map_err(of_trainee))
     }
 
     /// Returns whether the session exists, has an event log, and its journal is being written as run `run`.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::Session;
+use crate::{RecordedMark, Session};
 use palpate_exercise::answers::{AnswerRules, HiddenTarget, MarkedPlace, place_count};
 use palpate_exercise::incision::{SeveredPlace, TargetLine};
 use palpate_exercise::tasks::{AvoidedBall, LiftTarget, TaskMeasures};
@@ -32,6 +32,8 @@ pub struct ExerciseJudge {
     ties_before: Vec<usize>,
     /// Whether the trainee has done anything: touched the tissue, cut it, or marked a place.
     has_acted: bool,
+    /// Number of marks that were there at the beginning.
+    marks_before: usize,
 }
 
 /// A criterion of the score and what it earned.
@@ -76,6 +78,7 @@ impl ExerciseJudge {
             severed_before: 0,
             ties_before: Vec::new(),
             has_acted: false,
+            marks_before: 0,
             rate_hz: model.scene.stepping.rate_hz,
             exercise: Arc::new(exercise.clone()),
         })
@@ -87,12 +90,13 @@ impl ExerciseJudge {
         let step = session.step_count();
         if step == self.begin_step {
             self.severed_before = session.tissue().cuts().len();
+            self.marks_before = session.marks().len();
             self.ties_before = session.tissue().ties().iter().map(|tie| tie.number).collect();
         }
         // A blade in a tissue without toughness feels nothing.
         self.has_acted = self.has_acted
             || rows.iter().any(|row| row.is_in_contact)
-            || !session.marks().is_empty()
+            || !self.answers(session).is_empty()
             || session.tissue().cuts().len() > self.severed_before;
         if step > self.newest {
             let up = -self.exercise.seen_along;
@@ -153,6 +157,11 @@ impl ExerciseJudge {
         (all > 0.0).then_some(ExerciseScore { percent: 100.0 * earned / all, criteria })
     }
 
+    /// Returns the places that were marked since the exercise began.
+    pub fn answers<'s>(&self, session: &'s Session) -> &'s [RecordedMark] {
+        session.marks().get(self.marks_before..).unwrap_or_default()
+    }
+
     /// Returns the truth of the exercise beside what is there now: with [`ExerciseJudge::tasks`] it gives the figures that need the truth.
     pub fn truth(&self, session: &Session) -> ExerciseTruth {
         let seen_along = self.exercise.seen_along;
@@ -170,10 +179,8 @@ impl ExerciseJudge {
                 (self.lumps.iter().map(target).collect(), (hidden.count[1] > 0).then_some(rules))
             }
         };
-        let answer = |placed: &crate::RecordedMark| MarkedPlace {
-            place_m: placed.mark.place_m,
-            diameter_m: placed.mark.diameter_m,
-        };
+        let answer =
+            |placed: &RecordedMark| MarkedPlace { place_m: placed.mark.place_m, diameter_m: placed.mark.diameter_m };
         let line = |line: &palpate_tissue::scene::exercise::CutLine| TargetLine {
             points_m: line.points_m.clone(),
             within_m: line.within_m,
@@ -184,7 +191,7 @@ impl ExerciseJudge {
             seen_along,
             targets,
             rules,
-            answers: session.marks().iter().map(answer).collect(),
+            answers: self.answers(session).iter().map(answer).collect(),
             lines: self.exercise.lines.iter().map(line).collect(),
             severed: severed(session, self.severed_before),
             stitches_m: session.tissue().ties().iter().filter(holds).map(bites_m).collect(),

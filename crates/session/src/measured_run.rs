@@ -1,9 +1,9 @@
 //! What was done in a session, measured step by step and judged by an exercise if there is one, up to the end of the exercise.
 
-use crate::Session;
 use crate::chosen_exercise::ChosenExercise;
 use crate::exercise_judge::{ExerciseJudge, ExerciseScore};
 use crate::measure_recorder::MeasureRecorder;
+use crate::{RecordedMark, Session};
 use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, Measures};
 use palpate_refusal::Result;
 use palpate_tissue::Model;
@@ -104,6 +104,11 @@ impl MeasuredRun {
     /// Returns the step at which the time of the exercise is up; `None` without a limit.
     pub fn limit_step(&self) -> Option<u64> {
         self.judge.as_ref().and_then(ExerciseJudge::limit_step)
+    }
+
+    /// Returns the places that were marked since the exercise began; all marks without an exercise.
+    pub fn answers<'s>(&self, session: &'s Session) -> &'s [RecordedMark] {
+        self.judge.as_ref().map_or(session.marks(), |judge| judge.answers(session))
     }
 
     /// Returns what was measured so far.

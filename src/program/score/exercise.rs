@@ -177,7 +177,7 @@ impl ScoredExercise {
                 .flat_map(|ExerciseScore { criteria, .. }| criteria.iter().map(criterion))
                 .collect(),
             lumps: judge.lumps().iter().map(lump).collect(),
-            answers: session.marks().iter().map(answer).collect(),
+            answers: judge.answers(session).iter().map(answer).collect(),
         }
     }
 }

@@ -11,6 +11,7 @@ use std::time::UNIX_EPOCH;
 use palpate_proto::pb;
 
 use super::super::config::Config;
+use super::super::trainee::shows_hidden;
 use super::super::uploads::{FilePart, UploadKind, Uploads};
 use super::folder::Folder;
 use super::keeper::unix_ns;
@@ -294,6 +295,24 @@ impl Recorded {
         let reader = JournalReader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
         let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
         Ok((reader, session_id, run))
+    }
+
+    /// Refuses a journal of this server whose exercise hides something ([`Reason::NotForTrainee`]).
+    ///
+    /// # Errors
+    /// Also refuses a journal that does not exist, or can't be read.
+    pub(in crate::server) fn check_hides_nothing(&self, moment: &pb::JournalMoment, payer: &Account) -> Result<()> {
+        if !moment.upload_id.is_empty() {
+            return Ok(());
+        }
+        let check = || {
+            let (file, reader) = find(self.folder("journal")?, &moment.session_id, moment.run, Some(payer))?;
+            let place = file::name(&file.session_id, file.run);
+            let chosen = journal::exercise::from_header(&place, reader.header())?;
+            let hides = chosen.is_some_and(|chosen| chosen.exercise.hides_truth());
+            if hides { Err(shows_hidden()) } else { Ok(()) }
+        };
+        check().map_err(|refusal| refusal.within("journal"))
     }
 
     /// Creates a session that starts at a moment of a journal, and continues live or plays back the recording.

@@ -40,6 +40,11 @@ impl Gravity {
         Err(Refusal::new(Reason::OutOfRange, "gravity.acceleration_m_per_s2", message))
     }
 
+    /// Returns whether the tissue rests in the shape of its file.
+    pub fn is_at_rest(&self) -> bool {
+        self.pull_m_per_s2() == DVec3::ZERO
+    }
+
     /// Returns the acceleration that stress must balance, m/s².
     pub(crate) fn pull_m_per_s2(&self) -> DVec3 {
         if self.is_loaded { DVec3::ZERO } else { self.acceleration_m_per_s2 }
