@@ -45,7 +45,7 @@ impl Scale {
         let step = match (self, parameter) {
             (Scale::Poisson(_), _) => return [-0.1; 2],
             (_, TissueParameter::BranchTime(_)) => return [-0.2; 2],
-            _ if parameter.adds_by_motion() => -0.5,
+            _ if parameter.adds_by_motion() => -0.2,
             _ => -0.03,
         };
         [step, f64::exp_m1(step)]
