@@ -21,7 +21,7 @@ use super::{Failure, write_file};
 pub(crate) struct MeshArguments {
     /// The mesh file
     file: PathBuf,
-    /// Unit of the file's lengths: m, cm, mm, or the metres of one unit; required, but with --label mm by default
+    /// Unit of the file's lengths: m, cm, mm, or the metres of one unit; with --label by default the file's own or mm, else required
     #[arg(long, value_name = "UNIT")]
     unit: Option<String>,
     /// The label of a label map (NRRD, NIfTI, DICOM) whose surface is the mesh; default: its only one
@@ -80,12 +80,12 @@ struct ToldRegion {
 /// Checks a mesh; repairs and writes it if requested.
 pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let name = arguments.file.display().to_string();
-    let unit = arguments.unit.as_deref().or(arguments.label.and(Some("mm")));
-    let Some(unit) = unit else {
+    if arguments.unit.is_none() && arguments.label.is_none() {
         let message = "no unit: mesh files do not state theirs; give --unit mm, cm, m, or the metres of one unit";
         return Err(Failure::Refused(format!("{name}: {message}")));
-    };
-    let unit: Unit = unit.parse().map_err(|problem| Failure::Refused(format!("--unit: {problem}")))?;
+    }
+    let unit = arguments.unit.as_deref().map(str::parse::<Unit>).transpose();
+    let unit = unit.map_err(|problem| Failure::Refused(format!("--unit: {problem}")))?;
     if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < MIN_VERTICES) {
         let message = format!("--vertices: must be at least {MIN_VERTICES}, but is {vertices}");
         return Err(Failure::Refused(message));
@@ -100,13 +100,14 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let neighbours = |name: &str| files::read_regular(&folder.join(name), limits.bytes as u64).ok();
     let read = match arguments.label {
         Some(label) => read_label(&name, &bytes, label, unit, &limits),
-        None => read(&name, &bytes, unit, &neighbours, &limits),
+        None => read(&name, &bytes, unit.unwrap_or_default(), &neighbours, &limits),
     };
     let found = match read {
         Ok(found) => found,
-        Err(error) => return refuse(arguments, &name, error, unit),
+        Err(error) => return refuse(arguments, &name, error, unit.unwrap_or_default()),
     };
     drop(bytes);
+    let unit = found.unit;
     let told = MeshDescription { file: name, notes: found.notes, unit, ..MeshDescription::default() };
     let (mut told, mesh) = treat(arguments, found.mesh, told);
     let group = |group: &Group| ToldGroup { name: group.name.clone(), vertices: group.vertices.len() };

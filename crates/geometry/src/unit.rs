@@ -1,4 +1,4 @@
-//! Unit of the lengths in a file. Mesh files don't state it, so the user specifies it.
+//! Unit of the lengths in a file. Mesh files don't state it, so the user specifies it; scans may.
 
 use std::fmt;
 use std::str::FromStr;
@@ -25,6 +25,10 @@ impl Default for Unit {
 impl Unit {
     /// The metre, in which all lengths of this crate are.
     pub const METRE: Unit = Unit { metres: 1.0 };
+
+    pub(crate) const CENTIMETRE: Unit = Unit { metres: 1e-2 };
+    pub(crate) const MILLIMETRE: Unit = Unit { metres: 1e-3 };
+    pub(crate) const MICROMETRE: Unit = Unit { metres: 1e-6 };
 
     /// Returns the length of one unit in metres: above 0 and finite.
     #[must_use]

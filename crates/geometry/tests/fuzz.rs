@@ -134,7 +134,7 @@ fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
     let is_label_map = [".nrrd", ".nii", ".gz", ".dcm"].iter().any(|end| name.ends_with(end));
     let limits = ReadLimits::default();
     let read = if is_label_map {
-        read_label(name, bytes, if name.ends_with("dcm") { 1 } else { 3 }, Unit::METRE, &limits)
+        read_label(name, bytes, if name.ends_with("dcm") { 1 } else { 3 }, Some(Unit::METRE), &limits)
     } else {
         read(name, bytes, Unit::METRE, &neighbour, &limits)
     };

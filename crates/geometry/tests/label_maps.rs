@@ -14,7 +14,7 @@ fn mm() -> Unit {
 }
 
 fn read_mm(name: &str, bytes: &[u8], label: i64) -> Result<ReadMesh, MeshError> {
-    read_label(name, bytes, label, mm(), &ReadLimits::default())
+    read_label(name, bytes, label, Some(mm()), &ReadLimits::default())
 }
 
 /// Asserts that a surface is closed and of some parts, and encloses the voxels of a label. Returns the mesh.
@@ -120,6 +120,51 @@ fn formats_orders_and_encodings_give_the_same_surface_also_in_turned_and_mirrore
         let far = found.vertices_m.iter().zip(&wanted.vertices_m).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
         assert!(far < 1e-8, "{name}: {far}");
     }
+    for (space, signs) in [
+        ("LPS", [1.0, 1.0, 1.0]),
+        ("right-anterior-superior", [-1.0, -1.0, 1.0]),
+        ("left-anterior-superior-time", [1.0, -1.0, 1.0]),
+        ("LAST", [1.0, -1.0, 1.0]),
+        ("3D-right-handed", [1.0, 1.0, 1.0]),
+        ("3D-left-handed", [1.0, 1.0, -1.0]),
+    ] {
+        let signs = DVec3::from_array(signs);
+        let axes = DMat3::from_diagonal(signs) * scan.axes;
+        let file = Scan { axes, origin: signs * scan.origin, labels: scan.labels.clone(), ..scan }.nrrd(false, false);
+        let mut file = edited(&file, "left-posterior-superior", space);
+        if space.ends_with("time") || space == "LAST" {
+            file = (0..4)
+                .fold(file, |file, _| edited(&file, ")", ",0]"))
+                .into_iter()
+                .map(|b| if b == b']' { b')' } else { b })
+                .collect();
+        }
+        let found = read_mm("a.nrrd", &file, 3).unwrap_or_else(|e| panic!("{e}")).mesh;
+        assert_eq!(found, read_mm("a.nrrd", &scan.nrrd(false, false), 3).unwrap().mesh, "{space}");
+    }
+}
+
+/// Returns a file with the first of a text replaced.
+#[track_caller]
+fn edited(file: &[u8], from: &str, to: &str) -> Vec<u8> {
+    let text: String = file.iter().map(|byte| char::from(*byte)).collect();
+    assert!(text.contains(from), "{from}");
+    text.replacen(from, to, 1).chars().map(|letter| letter as u8).collect()
+}
+
+#[test]
+fn the_icon_of_a_segmentation_does_not_change_it() {
+    let wanted = read_mm("a.dcm", common::DICOM_BITS, 1).unwrap();
+    let content = b"\x28\0\x10\0US\x02\0\x01\0\x28\0\x11\0US\x02\0\x01\0\x28\0\x30\0DS\x04\x009\\9 \
+        \x28\0\0\x01US\x02\0\x08\0\xe0\x7f\x10\0OW\0\0\x02\0\0\0\0\0";
+    let length = |bytes: usize| u32::try_from(bytes).unwrap().to_le_bytes();
+    let mut icon = [b"\x88\0\0\x02SQ\0\0", &length(content.len() + 8)[..], b"\xfe\xff\0\xe0"].concat();
+    icon.extend([&length(content.len())[..], content].concat());
+    let at = common::DICOM_BITS.windows(4).rposition(|four| four == b"\xe0\x7f\x10\0").unwrap();
+    let (before, pixels) = common::DICOM_BITS.split_at(at);
+    for file in [[before, &icon, pixels].concat(), [before, pixels, &icon].concat()] {
+        assert_eq!(read_mm("a.dcm", &file, 1), Ok(wanted.clone()));
+    }
 }
 
 #[test]
@@ -154,15 +199,10 @@ fn a_label_map_names_its_labels_and_what_is_not_read() {
     let scan = small_scan();
     let nrrd = scan.nrrd(false, false);
     let with = |from: &str, to: &str| {
-        let text: String = nrrd.iter().map(|byte| char::from(*byte)).collect();
-        assert!(text.contains(from), "{from}");
-        let bent: Vec<u8> = text.replacen(from, to, 1).chars().map(|letter| letter as u8).collect();
-        read_mm("a.nrrd", &bent, 3).map_or_else(|e| e.to_string(), |_| "read".to_owned())
+        read_mm("a.nrrd", &edited(&nrrd, from, to), 3).map_or_else(|e| e.to_string(), |_| "read".to_owned())
     };
     let dicom = |from: &str, to: &str| {
-        let text: String = common::DICOM_BITS.iter().map(|byte| char::from(*byte)).collect();
-        assert!(text.contains(from), "{from}");
-        let bent: Vec<u8> = text.replacen(from, to, 1).chars().map(|letter| letter as u8).collect();
+        let bent = edited(common::DICOM_BITS, from, to);
         read_mm("a.dcm", &bent, 1).map_or_else(|e| e.to_string(), |_| "read".to_owned())
     };
     let plain = |name: &str, bytes: &[u8]| read(name, bytes, mm(), &|_| None, &ReadLimits::default());
@@ -187,6 +227,10 @@ fn a_label_map_names_its_labels_and_what_is_not_read() {
         ("line 3: voxels of the type `block`", with("type: short", "type: block")),
         ("voxels in another file are not read", with("encoding: raw", "data file: x.raw")),
         ("the header has no `endian`", with("endian: little\n", "")),
+        ("the header has no `endian`", with("endian: little\nencoding: raw", "encoding: gzip")),
+        ("line 9: `foo` is no order of bytes", with("endian: little", "endian: foo")),
+        ("line 5: the space `patient` is not read", with("left-posterior-superior", "patient")),
+        ("line 7: `(1,x,0,0)` is not a vector", with("(1,0,0)", "(1,x,0,0)")),
         ("the axes of the voxels are not finite, in one plane", with("(1,0,0)", "(0,1,0)")),
         ("2 axes in space are not read", with("sizes: 16 14 12", "sizes: 16 14")),
         (
@@ -199,6 +243,8 @@ fn a_label_map_names_its_labels_and_what_is_not_read() {
         ),
         ("a segmentation of the type BLURRY with 1 bits", dicom("BINARY", "BLURRY")),
         ("frames that are shifted, or unevenly apart", dicom("\\13.0", "\\13.9")),
+        ("where numbers are expected: 3", dicom("\\13.0", "\\13.x")),
+        ("two frames of one segment at one place", dicom("\\13.0", "\\15.0")),
         ("it has no voxels", dicom("\u{e0}\u{7f}\u{10}\0", "\u{e0}\u{7f}\u{11}\0")),
         ("read", with("sizes: 16 14 12\nspace directions:", "sizes: 1 16 14 12\nspace directions: none")),
         ("each side has from 1", with("16 14 12", "0 14 12")),
@@ -212,4 +258,13 @@ fn a_label_map_names_its_labels_and_what_is_not_read() {
     let found = read("a.nii", &one.nifti(false), Unit::METRE, &|_| None, &ReadLimits::default()).unwrap();
     assert!(found.notes[0].contains("the label 5. Voxels: "), "{:?}", found.notes);
     assert!(found.notes[1].contains("in units of 0.001 m, not in m"), "{:?}", found.notes);
+    // Without a unit, it is that of the file, or else mm.
+    let mut file = one.nifti(false);
+    for (code, metres) in [(0, 1e-3), (1, 1.0), (2, 1e-3), (3, 1e-6)] {
+        file[123] = code;
+        let found = read_label("a.nii", &file, 5, None, &ReadLimits::default()).unwrap();
+        assert_eq!((found.unit.metres(), found.notes.len()), (metres, 1), "{code}: {:?}", found.notes);
+        let ratio = report(&found.mesh).volume_m3.unwrap() / (one.volume(5) * metres.powi(3));
+        assert!((ratio - 1.0).abs() < 1e-3, "{code}: {ratio}");
+    }
 }

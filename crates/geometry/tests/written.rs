@@ -112,7 +112,7 @@ fn medit_and_abaqus_name_what_they_do_not_read() {
     let abaqus = common::abaqus();
     for (says, message) in [
         ("line 3: a mesh of dimension 2", refusal("a.mesh", &medit.replace("3 # of", "2 # of"))),
-        ("line 24: vertex 8 does not exist", refusal("a.mesh", &medit.replace("1 3 5 7 0", "1 3 5 9 0"))),
+        ("line 25: vertex 8 does not exist", refusal("a.mesh", &medit.replace("1 3 5 7 0", "1 3 5 9 0"))),
         ("the file ends early: `End`", refusal("a.mesh", &medit.replace("End", ""))),
         ("the file ends early: the section Vertices", refusal("a.mesh", "MeshVersionFormatted 1\nEnd\n")),
         ("`0,5` has a decimal comma", refusal("a.mesh", &medit.replace("0 0 0 1", "0 0 0,5 1"))),
@@ -121,6 +121,10 @@ fn medit_and_abaqus_name_what_they_do_not_read() {
         (
             "an assembly of more than one instance",
             refusal("a.inp", &abaqus.replace("*Node\n10", "*Instance\n*Node\n10")),
+        ),
+        (
+            "line 3: an instance that is translated or rotated",
+            refusal("a.inp", "*Instance, name=a\n0, 0, 0.\n0,0,0, 0,0,1, 90.\n"),
         ),
         ("elements in more than one part", refusal("a.inp", &(abaqus.clone() + "*PART\n*ELEMENT,TYPE=S3\n"))),
         ("elements of the type CAX4R are not read", refusal("a.inp", &abaqus.replace("C3D4H", "CAX4R"))),

@@ -53,6 +53,7 @@ const NO_SURFACE: [&str; 9] = ["SPRING", "DASHPOT", "MASS", "ROTARYI", "CONN", "
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Data {
     Unused,
+    Placement,
     Nodes,
     Elements { nodes: usize, kind: ElementKind, group: Option<usize> },
 }
@@ -85,6 +86,7 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
         }
         match data {
             Data::Unused => {}
+            Data::Placement => file.placement(line)?,
             Data::Nodes => file.node(line)?,
             Data::Elements { nodes, kind, group } => file.element(line, nodes, kind, group)?,
         }
@@ -177,7 +179,7 @@ impl<'s> AbaqusFile<'s, '_, '_> {
                 }
                 self.section += 1;
                 self.nodes = NumberedNodes::default();
-                Ok(Data::Unused)
+                Ok(if name == b"*INSTANCE" { Data::Placement } else { Data::Unused })
             }
             _ => Ok(Data::Unused),
         }
@@ -212,6 +214,18 @@ impl<'s> AbaqusFile<'s, '_, '_> {
     fn number<T: std::str::FromStr>(&self, field: Option<&[u8]>, what: &str) -> Result<T, MeshError> {
         let field = field.filter(|field| !field.is_empty()).ok_or_else(|| self.row.truncated(what))?;
         parsed(field).ok_or_else(|| self.row.no_number(field, what))
+    }
+
+    /// Reads how an instance is moved: a translation, or two points of an axis and an angle. Refuses one that is.
+    fn placement(&self, line: &[u8]) -> Result<(), MeshError> {
+        let given = fields(line).filter(|field| !field.is_empty()).take(8);
+        let numbers: Vec<f64> = given.map(|field| self.number(Some(field), "a placement")).collect::<Result<_, _>>()?;
+        let moves = if let [_, _, _, _, _, _, angle] = &numbers[..] { std::slice::from_ref(angle) } else { &numbers };
+        if moves.iter().all(|number| *number == 0.0) {
+            return Ok(());
+        }
+        let message = "an instance that is translated or rotated is not read: export the part where it is";
+        Err(self.unsupported(message.to_owned()))
     }
 
     /// Reads a node: its number, and up to three coordinates; a missing one is 0.

@@ -9,7 +9,7 @@ use super::label_map::LabelMap;
 use super::source::{Order, Scalar, parsed, words};
 use super::voxels::{LabelRun, LabelSource, MAX_SIDE};
 use crate::work::spend;
-use crate::{Element, MeshError, Problem};
+use crate::{Element, MeshError, Problem, Unit};
 
 /// Length of the part before the first element, which ends with the word `DICM`.
 const PREAMBLE: usize = 132;
@@ -50,6 +50,9 @@ const END_OF_SEQUENCE: u32 = 0xfffe_e0dd;
 /// Sequences that files without types (implicit VR) give with a length.
 const SEQUENCES: [u32; 6] = [0x0020_9113, 0x0020_9116, 0x0028_9110, 0x0062_000a, OF_ALL_FRAMES, OF_EACH_FRAME];
 
+/// Elements of the image as a whole. Others of the same tags are those of an icon or of an image that is referred to.
+const OF_IMAGE: [u32; 7] = [FRAMES, ROWS, COLUMNS, BITS, KIND, LARGEST_FRACTION, PIXELS];
+
 /// A frame: its segment, and the middle of its first voxel.
 #[derive(Debug, Clone, Copy, Default)]
 struct Frame {
@@ -87,7 +90,7 @@ pub(super) fn read<'a>(
     bytes: &'a [u8],
     allowance: &mut MemoryAllowance<'_>,
 ) -> Result<LabelMap<'a>, MeshError> {
-    let mut reader = Elements { bytes, at: PREAMBLE, has_types: true, allowance };
+    let mut reader = Elements { bytes, at: PREAMBLE, has_types: true, is_of_frames: false, allowance };
     let mut found = Segmentation::default();
     let read = reader.data_set(bytes.len(), 0, &mut found);
     let at = Element::Byte(reader.at as u64);
@@ -103,6 +106,8 @@ struct Elements<'a, 'b, 'l> {
     at: usize,
     /// Whether elements have types (explicit VR).
     has_types: bool,
+    /// Whether the outermost sequence tells of frames.
+    is_of_frames: bool,
     allowance: &'b mut MemoryAllowance<'l>,
 }
 
@@ -168,7 +173,9 @@ impl<'a> Elements<'a, '_, '_> {
                 if tag == TRANSFER_SYNTAX {
                     has_types_next = has_types(value)?;
                 }
-                found.element(tag, value);
+                if depth == 0 || self.is_of_frames && !OF_IMAGE.contains(&tag) {
+                    found.element(tag, value)?;
+                }
             }
             debug_assert!(self.at > start);
         }
@@ -180,6 +187,9 @@ impl<'a> Elements<'a, '_, '_> {
         if depth > MAX_DEPTH {
             return Err(Problem::Syntax { message: format!("more than {MAX_DEPTH} sequences within each other") });
         }
+        if depth == 1 {
+            self.is_of_frames = tag == OF_ALL_FRAMES || tag == OF_EACH_FRAME;
+        }
         while self.at < end {
             let item = self.tag()?;
             let length = self.number(Scalar::U32)?;
@@ -189,7 +199,7 @@ impl<'a> Elements<'a, '_, '_> {
             if item != ITEM {
                 return Err(Problem::Syntax { message: "an item of a sequence is expected".to_owned() });
             }
-            if tag == OF_EACH_FRAME {
+            if tag == OF_EACH_FRAME && depth == 1 {
                 self.allowance.push(&mut found.frames, Frame::default())?;
             }
             let end = if length == UNDEFINED { end } else { self.at.saturating_add(length).min(end) };
@@ -213,20 +223,24 @@ fn has_types(syntax: &[u8]) -> Result<bool, Problem> {
     }
 }
 
-/// Returns numbers in text, with backslashes between them.
-fn numbers<const N: usize>(text: &[u8]) -> Option<[f64; N]> {
-    let numbers: Vec<f64> = text
-        .split(|byte| *byte == b'\\')
-        .take(N + 1)
-        .filter_map(|part| words(part).next().and_then(parsed))
-        .filter(|number: &f64| number.is_finite())
-        .collect();
-    numbers.try_into().ok()
+/// Returns numbers in text, with backslashes between them; `None` for an element without a value.
+fn numbers<const N: usize>(text: &[u8]) -> Result<Option<[f64; N]>, Problem> {
+    let text = text.strip_suffix(b"\0").unwrap_or(text).trim_ascii();
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let parts = text.split(|byte| *byte == b'\\').take(N + 1);
+    let number = |part: &[u8]| parsed(part.trim_ascii()).filter(|number: &f64| number.is_finite());
+    let found: Option<Vec<f64>> = parts.map(number).collect();
+    let found = found.and_then(|found| found.try_into().ok());
+    let bad =
+        || Problem::Syntax { message: format!("`{}` where numbers are expected: {N}", super::source::shown(text)) };
+    found.ok_or_else(bad).map(Some)
 }
 
 impl<'a> Segmentation<'a> {
     /// Takes an element that matters. One of a frame goes to the last frame.
-    fn element(&mut self, tag: u32, value: &'a [u8]) {
+    fn element(&mut self, tag: u32, value: &'a [u8]) -> Result<(), Problem> {
         let whole = || usize::try_from(Scalar::U16.integer(value, Order::Little)).unwrap_or(0);
         match tag {
             KIND => self.kind = value.trim_ascii_end().to_owned(),
@@ -235,16 +249,16 @@ impl<'a> Segmentation<'a> {
             FRAMES => self.count = words(value).next().and_then(parsed).unwrap_or(0),
             BITS => self.bits = whole(),
             LARGEST_FRACTION => self.largest = whole(),
-            PIXEL_SPACING => self.spacing = self.spacing.or_else(|| numbers(value)),
-            SLICE_SPACING => self.slices = self.slices.or_else(|| numbers(value).map(|[spacing]| spacing)),
-            SLICE_THICKNESS => self.thickness = self.thickness.or_else(|| numbers(value).map(|[thickness]| thickness)),
+            PIXEL_SPACING => self.spacing = self.spacing.or(numbers(value)?),
+            SLICE_SPACING => self.slices = self.slices.or(numbers(value)?.map(|[spacing]| spacing)),
+            SLICE_THICKNESS => self.thickness = self.thickness.or(numbers(value)?.map(|[thickness]| thickness)),
             ORIENTATION => {
-                let directions = numbers(value).map(|[a, b, c, d, e, f]| [DVec3::new(a, b, c), DVec3::new(d, e, f)]);
+                let directions = numbers(value)?.map(|[a, b, c, d, e, f]| [DVec3::new(a, b, c), DVec3::new(d, e, f)]);
                 self.directions = self.directions.or(directions);
             }
             POSITION => {
                 if let Some(frame) = self.frames.last_mut() {
-                    frame.position = numbers(value).map(DVec3::from_array);
+                    frame.position = numbers(value)?.map(DVec3::from_array);
                 }
             }
             FRAME_SEGMENT => {
@@ -255,6 +269,7 @@ impl<'a> Segmentation<'a> {
             PIXELS => self.pixels = Some(value),
             _ => {}
         }
+        Ok(())
     }
 
     /// Puts the frames into a regular stack.
@@ -309,8 +324,17 @@ impl<'a> Segmentation<'a> {
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             frames.push((frame.segment, at.z.round() as usize));
         }
+        // Frames of labels are of all segments.
+        let mut places = frames.clone();
+        if let Values::Labels(_) = values {
+            places.iter_mut().for_each(|(segment, _)| *segment = 0);
+        }
+        places.sort_unstable();
+        if places.windows(2).any(|pair| pair[0] == pair[1]) {
+            return unsupported("two frames of one segment at one place are not read".to_owned());
+        }
         let voxels = Frames { sides, values, frames, pixels };
-        Ok(LabelMap { voxels: Box::new(voxels), axes, origin, unit_m: Some(1e-3) })
+        Ok(LabelMap { voxels: Box::new(voxels), axes, origin, unit: Some(Unit::MILLIMETRE) })
     }
 }
 

@@ -420,6 +420,6 @@ impl<'l> Draft<'l> {
             groups: self.groups,
             regions: self.regions,
         };
-        Ok(ReadMesh { mesh, notes: self.notes })
+        Ok(ReadMesh { mesh, unit, notes: self.notes })
     }
 }

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use super::draft::Draft;
 use super::smooth_surface::{self, PartGrid};
 use super::voxels::{LabelRun, LabelSource};
-use crate::Problem;
+use crate::{Problem, Unit};
 
 /// More different numbers than this are those of an image.
 const MAX_LABELS: usize = 4096;
@@ -37,8 +37,8 @@ pub(super) struct LabelMap<'a> {
     pub(super) axes: DMat3,
     /// The middle of the first voxel.
     pub(super) origin: DVec3,
-    /// The unit that the file says, m.
-    pub(super) unit_m: Option<f64>,
+    /// The unit that the file says.
+    pub(super) unit: Option<Unit>,
 }
 
 /// The voxels of a label: the box around them, and their number.

@@ -101,8 +101,13 @@ impl<'s> MeditFile<'s, '_, '_> {
                 self.elements(section)?;
             } else if word[0].is_ascii_alphabetic() {
                 // An unused section, such as one of normals: numbers up to the next name.
-                while self.source.peek().is_some_and(|word| !word[0].is_ascii_alphabetic()) {
-                    self.word();
+                loop {
+                    let before = self.source.clone();
+                    let Some(word) = self.word() else { break };
+                    if word[0].is_ascii_alphabetic() {
+                        self.source = before;
+                        break;
+                    }
                 }
             } else {
                 let message = format!("`{}`: a section such as Vertices is expected", shown(word));

@@ -59,6 +59,8 @@ impl Default for ReadLimits {
 pub struct ReadMesh {
     /// The mesh: coordinates are finite, in metres, and indices in range. It may be empty.
     pub mesh: TriangleMesh,
+    /// Unit of the file's lengths.
+    pub unit: Unit,
     /// What was done to it, and what was left out, one sentence each; empty if it is just what the file has.
     pub notes: Vec<String>,
 }
@@ -197,11 +199,12 @@ pub fn read_paid(
     limits: &ReadLimits,
     pay: &mut dyn FnMut(u64) -> bool,
 ) -> Result<ReadMesh, MeshError> {
-    read_any(name, bytes, None, unit, neighbours, limits, pay)
+    read_any(name, bytes, None, Some(unit), neighbours, limits, pay)
 }
 
 /// Reads the surface around a label of a label map (NRRD, NIfTI or DICOM) like [`read`]: a closed surface without the stairs of
-/// voxels, whose volume is that of the voxels with the label. [`read`] does so if a file has one label.
+/// voxels, whose volume is that of the voxels with the label. [`read`] does so if a file has one label. Without `unit`, it is the
+/// one that the file states, or else mm.
 ///
 /// # Errors
 /// Returns the refusals of [`read`], and refuses other formats, 0, and a label that no voxel has.
@@ -209,7 +212,7 @@ pub fn read_label(
     name: &str,
     bytes: &[u8],
     label: i64,
-    unit: Unit,
+    unit: Option<Unit>,
     limits: &ReadLimits,
 ) -> Result<ReadMesh, MeshError> {
     read_any(name, bytes, Some(label), unit, &|_| None, limits, &mut |_| true)
@@ -219,7 +222,7 @@ fn read_any(
     name: &str,
     bytes: &[u8],
     label: Option<i64>,
-    unit: Unit,
+    mut unit: Option<Unit>,
     neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
     limits: &ReadLimits,
     pay: &mut dyn FnMut(u64) -> bool,
@@ -264,10 +267,12 @@ fn read_any(
                 _ => dicom::read(name, bytes, &mut draft.allowance)?,
             };
             map.surface(label, &mut draft).map_err(fail)?;
-            if let Some(own) = map.unit_m.filter(|own| *own != unit.metres()) {
-                draft.notes.push(format!("The file says that its lengths are in units of {own} m, not in {unit}."));
+            let unit = *unit.get_or_insert(map.unit.unwrap_or(Unit::MILLIMETRE));
+            if let Some(own) = map.unit.filter(|own| *own != unit) {
+                let own_m = own.metres();
+                draft.notes.push(format!("The file says that its lengths are in units of {own_m} m, not in {unit}."));
             }
         }
     }
-    draft.finish(name, unit)
+    draft.finish(name, unit.unwrap_or_default())
 }

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use super::label_map::LabelMap;
 use super::source::{Order, Scalar};
 use super::voxels::{Unpacked, Voxels};
-use crate::{Element, MeshError, Problem};
+use crate::{Element, MeshError, Problem, Unit};
 
 /// Length of the header, which is also its first number.
 const HEADER: usize = 348;
@@ -81,13 +81,13 @@ pub(super) fn read<'a>(name: &str, bytes: &'a [u8]) -> Result<LabelMap<'a>, Mesh
         is_gzip,
         skip: offset as usize,
     };
-    let unit_m = match header[123] & 7 {
-        1 => Some(1.0),
-        2 => Some(1e-3),
-        3 => Some(1e-6),
+    let unit = match header[123] & 7 {
+        1 => Some(Unit::METRE),
+        2 => Some(Unit::MILLIMETRE),
+        3 => Some(Unit::MICROMETRE),
         _ => None,
     };
-    Ok(LabelMap { voxels: Box::new(voxels), axes, origin, unit_m })
+    Ok(LabelMap { voxels: Box::new(voxels), axes, origin, unit })
 }
 
 /// Returns the step from a voxel to the next along each axis, and the middle of the first voxel: by the affine

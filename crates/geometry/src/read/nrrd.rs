@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use super::label_map::LabelMap;
 use super::source::{Order, Scalar, Source, parsed, shown};
 use super::voxels::Voxels;
-use crate::{MeshError, Problem};
+use crate::{MeshError, Problem, Unit};
 
 /// The fields of a header that matter.
 #[derive(Default)]
@@ -20,7 +20,11 @@ struct Header {
     directions: Option<Vec<Option<DVec3>>>,
     spacings: Option<Vec<f64>>,
     origin: DVec3,
-    unit_m: Option<f64>,
+    /// Signs that turn the space of directions and origin into left-posterior-superior, or another right-handed one.
+    signs: Option<DVec3>,
+    /// Whether vectors have a fourth number, of time.
+    has_time: bool,
+    unit: Option<Unit>,
     skip: usize,
 }
 
@@ -42,7 +46,7 @@ pub(super) fn read<'a>(mut source: Source<'a>) -> Result<LabelMap<'a>, MeshError
     let missing = |what: &str| source.syntax(format!("the header has no `{what}`"));
     let scalar = header.scalar.ok_or_else(|| missing("type"))?;
     let is_gzip = header.is_gzip.ok_or_else(|| missing("encoding"))?;
-    if scalar.size() > 1 && header.order.is_none() && !is_gzip {
+    if scalar.size() > 1 && header.order.is_none() {
         return Err(missing("endian"));
     }
     // An axis that is not in space, such as that of layers, is left out if it has one entry.
@@ -79,8 +83,11 @@ pub(super) fn read<'a>(mut source: Source<'a>) -> Result<LabelMap<'a>, MeshError
         is_gzip,
         skip: header.skip,
     };
+    // Without directions, the axes are not said to be those of the space.
+    let signs = header.signs.filter(|_| header.directions.is_some()).unwrap_or(DVec3::ONE);
     let axes = DMat3::from_cols(step(x, DVec3::X), step(y, DVec3::Y), step(z, DVec3::Z));
-    Ok(LabelMap { voxels: Box::new(voxels), axes, origin: header.origin, unit_m: header.unit_m })
+    let axes = DMat3::from_diagonal(signs) * axes;
+    Ok(LabelMap { voxels: Box::new(voxels), axes, origin: signs * header.origin, unit: header.unit })
 }
 
 impl Header {
@@ -107,7 +114,33 @@ impl Header {
                 });
             }
             b"sizes" => self.sizes = numbers(text, "a size")?,
-            b"endian" => self.order = Some(if lower == b"big" { Order::Big } else { Order::Little }),
+            b"endian" => {
+                self.order = Some(match &lower[..] {
+                    b"little" => Order::Little,
+                    b"big" => Order::Big,
+                    _ => {
+                        let message = format!("`{}` is no order of bytes: little or big", shown(text));
+                        return Err(Problem::Syntax { message });
+                    }
+                });
+            }
+            b"space" => {
+                let name = lower.strip_suffix(b"-time").unwrap_or(&lower);
+                self.has_time =
+                    name.len() < lower.len() || [b"rast", b"last", b"lpst"].iter().any(|short| name == *short);
+                self.signs = Some(match name {
+                    b"right-anterior-superior" | b"ras" | b"rast" => DVec3::new(-1.0, -1.0, 1.0),
+                    b"left-anterior-superior" | b"las" | b"last" => DVec3::new(1.0, -1.0, 1.0),
+                    b"left-posterior-superior" | b"lps" | b"lpst" | b"scanner-xyz" | b"3d-right-handed" => DVec3::ONE,
+                    b"3d-left-handed" => DVec3::new(1.0, 1.0, -1.0),
+                    _ => {
+                        let space = shown(text);
+                        return unsupported(format!(
+                            "the space `{space}` is not read: save in left-posterior-superior"
+                        ));
+                    }
+                });
+            }
             b"encoding" => {
                 self.is_gzip = Some(match &lower[..] {
                     b"raw" => false,
@@ -120,10 +153,10 @@ impl Header {
             b"data file" | b"datafile" => {
                 return unsupported("voxels in another file are not read: save one .nrrd file".to_owned());
             }
-            b"space directions" => self.directions = Some(directions(text)?),
+            b"space directions" => self.directions = Some(directions(text, self.has_time)?),
             b"spacings" => self.spacings = Some(numbers(text, "a spacing")?),
-            b"space origin" => self.origin = vector(text)?,
-            b"space units" => self.unit_m = unit_m(&lower),
+            b"space origin" => self.origin = vector(text, self.has_time)?,
+            b"space units" => self.unit = unit(&lower),
             b"byte skip" | b"byteskip" => {
                 self.skip = parsed(text).ok_or_else(|| super::source::no_number(text, "a count of bytes to skip"))?;
             }
@@ -141,14 +174,15 @@ fn numbers<T: std::str::FromStr>(text: &[u8], what: &str) -> Result<Vec<T>, Prob
     super::source::words(text).take(16).map(number).collect()
 }
 
-/// Returns the directions of the axes: vectors in parentheses, or `none`.
-fn directions(text: &[u8]) -> Result<Vec<Option<DVec3>>, Problem> {
+/// Returns the directions of the axes: vectors in parentheses, or `none`. An axis of time alone is not in space.
+fn directions(text: &[u8], has_time: bool) -> Result<Vec<Option<DVec3>>, Problem> {
     let mut found = Vec::new();
     let mut rest = text.trim_ascii_start();
     while !rest.is_empty() && found.len() < 16 {
         let end = if rest.starts_with(b"(") {
             let end = rest.iter().position(|byte| *byte == b')').map_or(rest.len(), |end| end + 1);
-            found.push(Some(vector(&rest[..end])?));
+            let direction = vector(&rest[..end], has_time)?;
+            found.push(Some(direction).filter(|direction| !has_time || *direction != DVec3::ZERO));
             end
         } else {
             found.push(None);
@@ -159,24 +193,28 @@ fn directions(text: &[u8]) -> Result<Vec<Option<DVec3>>, Problem> {
     Ok(found)
 }
 
-/// Returns a vector such as `(1,0,-0.5)`.
-fn vector(text: &[u8]) -> Result<DVec3, Problem> {
+/// Returns a vector such as `(1,0,-0.5)`, without the number of time that may follow.
+fn vector(text: &[u8], has_time: bool) -> Result<DVec3, Problem> {
     let inner = text.trim_ascii().strip_prefix(b"(").and_then(|text| text.strip_suffix(b")"));
-    let parts: Vec<f64> = inner
-        .into_iter()
-        .flat_map(|text| text.split(|byte| *byte == b','))
-        .filter_map(|part| parsed(part.trim_ascii()))
-        .collect();
-    let vector = <[f64; 3]>::try_from(parts).map(DVec3::from_array);
-    vector.map_err(|_| Problem::Syntax { message: format!("`{}` is not a vector such as (1,0,0)", shown(text)) })
+    let parts = inner.into_iter().flat_map(|text| text.split(|byte| *byte == b','));
+    let parts: Option<Vec<f64>> = parts.take(5).map(|part| parsed(part.trim_ascii())).collect();
+    match parts.as_deref() {
+        Some(&[x, y, z]) if !has_time => Ok(DVec3::new(x, y, z)),
+        Some(&[x, y, z, _]) if has_time => Ok(DVec3::new(x, y, z)),
+        _ => {
+            let example = if has_time { "(1,0,0,0)" } else { "(1,0,0)" };
+            Err(Problem::Syntax { message: format!("`{}` is not a vector such as {example}", shown(text)) })
+        }
+    }
 }
 
-/// Returns the unit of lengths in metres, if it is one: the first word in quotes.
-fn unit_m(text: &[u8]) -> Option<f64> {
+/// Returns the unit of lengths, if it is one: the first word in quotes.
+fn unit(text: &[u8]) -> Option<Unit> {
     match text.split(|byte| *byte == b'"').nth(1)? {
-        b"mm" => Some(1e-3),
-        b"cm" => Some(1e-2),
-        b"m" => Some(1.0),
+        b"um" | b"\xc2\xb5m" => Some(Unit::MICROMETRE),
+        b"mm" => Some(Unit::MILLIMETRE),
+        b"cm" => Some(Unit::CENTIMETRE),
+        b"m" => Some(Unit::METRE),
         _ => None,
     }
 }

@@ -12,6 +12,9 @@ use crate::work::spend;
 /// Memory for unpacking, bytes: the state with its window.
 const STATE: usize = 1 << 16;
 
+/// Bytes that are skipped at once. A row may have only one.
+const SKIPPED: usize = 1 << 14;
+
 /// Longest row of voxels.
 pub(super) const MAX_SIDE: usize = 1 << 16;
 
@@ -81,15 +84,17 @@ impl LabelSource for Voxels<'_> {
         self.check()?;
         let size = self.scalar.size();
         let [row_voxels, rows, slices] = self.sides;
-        allowance.take(STATE + row_voxels * size)?;
+        let memory = STATE + (row_voxels * size).max(SKIPPED);
+        allowance.take(memory)?;
         let mut source = Unpacked::new(self.bytes, self.is_gzip)?;
-        let mut row = vec![0; row_voxels * size];
+        let mut row = vec![0; (row_voxels * size).max(SKIPPED)];
         let mut left = self.skip;
         while left > 0 {
             let part = left.min(row.len());
             source.fill(&mut row[..part])?;
             left -= part;
         }
+        row.truncate(row_voxels * size);
         for z in 0..slices {
             for y in 0..rows {
                 source.fill(&mut row)?;
@@ -107,7 +112,7 @@ impl LabelSource for Voxels<'_> {
                 }
             }
         }
-        allowance.give_back(STATE + row_voxels * size);
+        allowance.give_back(memory);
         Ok(())
     }
 }

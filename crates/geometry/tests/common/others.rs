@@ -119,7 +119,7 @@ pub fn medit_text() -> String {
     for [x, y, z] in VERTICES.into_iter().chain([MIDDLE]) {
         writeln!(text, "{x} {y} {z} 1").unwrap();
     }
-    text += "Edges 1\n1 2 0\nTriangles\n1\n1 3 5 4\nRequiredVertices\n2\n1\n2\nTetrahedra\n8\n";
+    text += "Edges 1\n1 2 0\nTriangles\n1\n1 3 5 4\nRequiredVertices\n2\n1\n2 # and\n# then\nTetrahedra\n8\n";
     for ([a, b, c, d], number) in tetrahedra(1).zip(0..) {
         writeln!(text, "{a} {b} {c} {d} {}", number / 4).unwrap();
     }

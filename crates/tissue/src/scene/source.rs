@@ -12,9 +12,6 @@ use crate::lock::lock;
 use crate::scene::toml_document::{Fields, Item};
 use palpate_refusal::{Reason, Result, excerpt};
 
-/// The unit of scans, if a scene does not give one.
-const SCAN_UNIT: &str = "mm";
-
 /// The files that a scene may name.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Files<'a> {
@@ -35,8 +32,8 @@ pub(super) enum SourceMesh {
 }
 
 impl Files<'_> {
-    /// Reads the mesh that a section names by `organ`, or by `file`, `unit` and the `label` of a scan, whose unit is mm if
-    /// there is none. Also returns the key, for refusals.
+    /// Reads the mesh that a section names by `organ`, or by `file`, `unit` and the `label` of a scan, whose unit is the
+    /// file's own, or mm, if there is none. Also returns the key, for refusals.
     pub(super) fn mesh<'a>(self, fields: &mut Fields<'a>, limits: &Limits) -> Result<(SourceMesh, Item<'a>)> {
         if let Some(organ) = fields.item("organ") {
             if let Some(file) = fields.item("file") {
@@ -46,11 +43,11 @@ impl Files<'_> {
         }
         let label = fields.item("label").map(|item| item.whole()).transpose()?;
         let unit = if label.is_some() && fields.item("unit").is_none() {
-            SCAN_UNIT.parse::<Unit>().unwrap_or_default()
+            None
         } else {
             let item = fields.required("unit")?;
             let unit = unit_text(&item)?.parse::<Unit>();
-            unit.map_err(|_| item.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit"))?
+            Some(unit.map_err(|_| item.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit"))?)
         };
         let file = fields.required("file")?;
         Ok((SourceMesh::Read(self.read(&file, label, unit, limits)?), file))
@@ -58,7 +55,7 @@ impl Files<'_> {
 
     /// Reads the mesh file that an item names, or a label of it. Files that this file names in turn must have bare names and be
     /// in the same folder.
-    fn read(self, item: &Item<'_>, label: Option<u64>, unit: Unit, limits: &Limits) -> Result<TriangleMesh> {
+    fn read(self, item: &Item<'_>, label: Option<u64>, unit: Option<Unit>, limits: &Limits) -> Result<TriangleMesh> {
         // Refusals use the name in the scene, so that clients do not learn where the server's files are.
         let name = item.text()?;
         let refuse = |message: String| Err(item.refuse(Reason::WrongKind, message));
@@ -87,7 +84,7 @@ impl Files<'_> {
                 let label = i64::try_from(label).unwrap_or(i64::MAX);
                 palpate_geometry::read_label(&name, &bytes, label, unit, &within)
             }
-            None => palpate_geometry::read(&name, &bytes, unit, &beside, &within),
+            None => palpate_geometry::read(&name, &bytes, unit.unwrap_or_default(), &beside, &within),
         };
         Ok(found.map_err(|error| item.refuse(Reason::Unreadable, error.to_string()))?.mesh)
     }
