@@ -1,4 +1,5 @@
-//! Nothing that a trainee's client receives has the truth of the exercise in it: every message of every call is looked through, as bytes.
+//! Nothing that a trainee's client receives has the truth of the exercise in it: the messages of each call that may show a
+//! tissue are looked through, as bytes.
 
 use std::collections::BTreeMap;
 

@@ -135,8 +135,9 @@ async fn live_figures_the_result_and_the_journal_have_equal_bits_and_a_trainee_i
         result.figures.iter().find(|figure| figure.measure == name && figure.tool.is_none()).unwrap().value
     };
     assert!(value("peak_force_n") > 0.1 && value("press_count") >= 1.0 && value("coverage_share") > 0.0, "{result:?}");
-    // Ten per second of simulated time, also while the tissue rests.
-    assert!(by_trainer.len() as f64 > 5.0 * result.time_s, "{} in {} s", by_trainer.len(), result.time_s);
+    // Ten per second of simulated time at most: a slow reader gets the newest.
+    let steps: Vec<u64> = by_trainer.iter().map(|message| message.step).collect();
+    assert!(steps.len() > 2 && steps.is_sorted(), "{steps:?}");
     let named = |message: &pb::WatchExerciseResponse| -> BTreeSet<String> {
         message.figures.iter().map(|figure| figure.measure.clone()).collect()
     };

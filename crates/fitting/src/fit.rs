@@ -93,7 +93,7 @@ pub struct Fit {
     pub rms_of_curves_n: Vec<f64>,
     /// `rms_n` divided by the largest measured force.
     pub relative_rms: f64,
-    /// 1 − Σ(fitted − measured)²/Σ(measured − mean)².
+    /// 1 − Σ(fitted − measured)²/Σ(measured − mean)²; 0 if all measured forces are equal.
     pub r_squared: f64,
     /// Standard deviation of the noise of a sample, N, from the residuals.
     pub noise_n: f64,
@@ -186,16 +186,16 @@ impl Fitter<'_> {
             let (minimum, uncertainty) = self.minimum(&active)?;
             let is_untold =
                 |index: &usize| active[*index].scale.is_too_wide(minimum.x[*index], uncertainty.half_widths[*index]);
-            let Some(worst) = (0..active.len()).rev().find(is_untold) else {
+            let Some(last) = (0..active.len()).rev().find(is_untold) else {
                 return Ok(self.finish(&original, &active, &minimum, uncertainty, untold));
             };
-            let parameter = active[worst].parameter;
-            let reason = reason(&active, worst, &minimum, &uncertainty);
+            let parameter = active[last].parameter;
+            let reason = reason(&active, last, &minimum, &uncertainty);
             if !self.options.parameters.is_empty() {
                 return Err(Refusal::new(Reason::Missing, parameter.name(), reason).into());
             }
             untold.push(UntoldParameter { parameter, value: parameter.value(&original).unwrap_or(0.0), reason });
-            names.remove(worst);
+            names.remove(last);
             // The others begin where they are.
             self.scene = self.scene_at(&active, &minimum.x)?;
             self.scene = parameter.set(&self.scene, parameter.value(&original).unwrap_or(0.0))?;
@@ -396,7 +396,7 @@ impl Fitter<'_> {
             rms_n: rms(&all),
             rms_of_curves_n,
             relative_rms: rms(&all) / largest_n,
-            r_squared: 1.0 - squares / spread,
+            r_squared: if spread > 0.0 { 1.0 - squares / spread } else { 0.0 },
             noise_n: uncertainty.noise,
             autocorrelation: uncertainty.autocorrelation,
             runs: *runs,

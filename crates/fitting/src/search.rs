@@ -5,6 +5,9 @@ use std::cell::RefCell;
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
+/// The residual, in norms of the measured forces, of each sample at a place where the runs have no value.
+const NO_VALUE: f64 = 1e6;
+
 /// The part of a standard error below which a step no longer matters: of N samples, it changes the sum of squares by its square
 /// divided by N.
 const NEAR: f64 = 0.03;
@@ -103,10 +106,10 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
         if self.failure.borrow().is_some() {
             return None;
         }
-        // A place without a value is worse than any that has one.
+        // A place without a value is worse than any that has one: there forces are at most some thousand times the measured ones.
         let residual = |index: usize, measured: f64| match &self.predicted {
             Some(predicted) => (predicted[index] - measured) / self.norm,
-            None => 10.0 * measured / self.norm,
+            None => NO_VALUE,
         };
         let residuals = self.measured.iter().enumerate().map(|(index, measured)| residual(index, *measured));
         Some(DVector::from_iterator(self.measured.len(), residuals))

@@ -95,7 +95,6 @@ impl Case {
             for (index, found) in fit.parameters.iter().enumerate() {
                 let truth = found.parameter.value(&self.truth).unwrap();
                 let [low, high] = found.interval;
-                println!("{what} {seed} {index} {} {}", found.value / truth, low <= truth && truth <= high);
                 within[index] += u32::from(low <= truth && truth <= high);
                 worst[index] = worst[index].max((found.value / truth - 1.0).abs());
                 width[index] = width[index].max((high - low) / 2.0 / truth);

@@ -21,6 +21,9 @@ const RESTS_S: f64 = 0.3;
 /// Number of samples of a press.
 const MAX_SAMPLES: usize = 1 << 20;
 
+/// The longest press, s.
+const LONGEST_S: f64 = 3600.0;
+
 /// A press: where, with what tip, and how deep at each time. Between two times the depth is on the straight line between theirs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImposedPress {
@@ -78,6 +81,8 @@ impl ImposedPress {
             let range = format!("reached with at most {SPEED_M_PER_S} m/s");
             number(&field, speed_m_per_s, &range, |speed| speed <= SPEED_M_PER_S)?;
         }
+        let lasts_s = self.time_s[times - 1] - self.time_s[0];
+        number("time_s", lasts_s, &format!("{LONGEST_S} s in all at most"), |lasts_s| lasts_s <= LONGEST_S)?;
         Ok(())
     }
 

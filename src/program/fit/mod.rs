@@ -81,18 +81,20 @@ pub(crate) fn fit_curves(arguments: &FitArguments) -> Result<(), Failure> {
     let fitted = with_fit_progress(arguments.quiet, |progress| fit(&model, &curves, &options, progress))?;
     fitted.warnings.iter().for_each(|warning| say!("palpate: warning: {warning}"));
     let report = FitReport::new(&model.scene.name, &curves, &fitted, clock_s() - begun_s);
+    // First: a fit takes minutes, and a file that can't be written must not take its result away.
+    let text = if arguments.json { report.json()? } else { report.to_string() };
+    match std::io::stdout().write_all(text.as_bytes()) {
+        // A reader that closed the pipe is not an error.
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => return Err(Failure::Failed(e.to_string())),
+        _ => {}
+    }
     if let Some(path) = &arguments.output {
         write_file(path, scene_text(arguments, path, &table, &curves, &fitted, &limits)?.as_bytes())?;
     }
     if let Some(path) = &arguments.plot {
         write_file(path, plot::svg(&curves, &fitted.fitted_n).as_bytes())?;
     }
-    let text = if arguments.json { report.json()? } else { report.to_string() };
-    match std::io::stdout().write_all(text.as_bytes()) {
-        // A reader that closed the pipe is not an error.
-        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Failure::Failed(e.to_string())),
-        _ => Ok(()),
-    }
+    Ok(())
 }
 
 /// Runs a fit and, unless `quiet`, shows on a terminal how far it is.
@@ -131,7 +133,11 @@ fn scene_text(
         100.0 * fitted.relative_rms,
         fitted.r_squared
     )];
-    let source = table.lines().map(str::trim).take_while(|line| line.is_empty() || line.starts_with('#'));
+    let source = table
+        .trim_start_matches('\u{feff}')
+        .lines()
+        .map(str::trim)
+        .take_while(|line| line.is_empty() || line.starts_with('#'));
     let source = source.filter_map(|line| line.strip_prefix('#')).take(SOURCE_LINES);
     head.extend(
         source.map(|line| {
