@@ -1,7 +1,7 @@
 // A real server and a real browser.
 
 import { spawn, spawnSync } from "node:child_process";
-import { existsSync, mkdirSync } from "node:fs";
+import { cpSync, existsSync, mkdirSync, mkdtempSync, readFileSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { delimiter, join, resolve } from "node:path";
 import { createInterface } from "node:readline";
@@ -133,6 +133,20 @@ export async function callSession({ url }, method, sessionId) {
     answer.headers.get("grpc-message") ?? /grpc-message:\s*([^\r\n]*)/.exec(told)?.[1] ?? "",
   ];
   return status === "0" ? undefined : `${status} ${message}`;
+}
+
+/**
+ * A folder with the shipped scenes, in which a blade feels nothing: on a busy machine a touch begins anew again and again, and tough tissue
+ * that was pushed is whole then. The caller removes it.
+ */
+export function scenesToCut() {
+  const folder = mkdtempSync(join(tmpdir(), "palpate-scenes-"));
+  cpSync(join(ROOT, "scenes"), folder, { recursive: true });
+  const liver = readFileSync(join(folder, "liver.toml"), "utf8");
+  const soft = liver.replace(/^toughness_j_per_m2 = .*$/m, "toughness_j_per_m2 = 0.0");
+  if (soft === liver) throw new Error("the scene has no toughness to take out");
+  writeFileSync(join(folder, "liver.toml"), soft);
+  return folder;
 }
 
 /** The tissue of most tests: a push moves it by centimetres. @param {Server} server */

@@ -1,8 +1,9 @@
 // Threads and clips on the page: `make test-viewer`.
 
 import assert from "node:assert/strict";
+import { rmSync } from "node:fs";
 import { after, before, describe, test } from "node:test";
-import { cut, pages, Server } from "./harness.mjs";
+import { cut, pages, scenesToCut, Server } from "./harness.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
@@ -10,10 +11,14 @@ const { open, close } = pages({ width: 820, height: 760 });
 
 /** @type {Server} */
 let server;
+const scenes = scenesToCut();
 before(async () => {
-  server = await Server.start();
+  server = await Server.start(["--scenes", scenes]);
 });
-after(async () => assert.equal(await server?.stop(), 0, "the server ends well although pages were open"));
+after(async () => {
+  assert.equal(await server?.stop(), 0, "the server ends well although pages were open");
+  rmSync(scenes, { recursive: true });
+});
 
 /** Cuts the middle of the sheet. @param {Page} page */
 async function cutMiddle(page) {

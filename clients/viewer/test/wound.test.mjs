@@ -5,7 +5,7 @@ import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { colourAt, pages, Server } from "./harness.mjs";
+import { colourAt, pages, scenesToCut, Server } from "./harness.mjs";
 import { Hostile, SESSION } from "./hostile.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
@@ -15,12 +15,13 @@ const { open, close } = pages({ width: 820, height: 560 });
 /** @type {Server} */
 let server;
 const journals = mkdtempSync(join(tmpdir(), "palpate-wound-"));
+const scenes = scenesToCut();
 before(async () => {
-  server = await Server.start(["--journal", journals]);
+  server = await Server.start(["--journal", journals, "--scenes", scenes]);
 });
 after(async () => {
   assert.equal(await server?.stop(), 0, "the server ends well although pages were open");
-  rmSync(journals, { recursive: true });
+  for (const folder of [journals, scenes]) rmSync(folder, { recursive: true });
 });
 
 /** Waits until the blade stands in the tissue: it feels nothing of one without toughness. @param {Page} page */
