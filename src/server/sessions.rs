@@ -141,6 +141,7 @@ impl SessionService for Sessions {
         if let Some(pb::create_session_request::Source::Journal(moment)) = &request.source
             && !may_see_hidden
         {
+            self.0.check_not_for_trainee(&moment.session_id)?;
             let (recorded, payer, moment) = (self.0.recorded.clone(), account.clone(), moment.clone());
             let check = move |_: &CancelFlag| recorded.check_hides_nothing(&moment, &payer);
             self.0.job_pool.work(&account, check).await??;

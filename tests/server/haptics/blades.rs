@@ -16,7 +16,7 @@ pub(crate) fn knife() -> Instrument {
     Instrument::of_tip(Tip { shape: TipShape::Blade, radius_m: 0.001, edge_m, ..Tip::default() })
 }
 
-/// Along `liver`, 5 mm deep, the edge upright.
+/// Along `fibrotic`, 5 mm deep, the edge upright: a blade feels nothing there, so that the cut is where its edge is.
 fn pose_at(step: u64) -> InstrumentPose {
     let y = 0.02 + 0.03 * step as f64 / STEPS as f64;
     let pose = InstrumentPose {
@@ -75,7 +75,7 @@ pub(crate) async fn lead(server: &TestServer, session: &str, touch: &mut TestTou
 #[tokio::test]
 async fn a_session_tells_what_a_blade_has_severed_and_a_snapshot_in_mid_cut_continues() {
     let server = TestServer::start(&[]);
-    let session = create(&server, pb::create_session_request::Source::SceneName("liver".into())).await;
+    let session = create(&server, pb::create_session_request::Source::SceneName("fibrotic".into())).await;
     let with_knife =
         |session: &str| pb::TouchOpen { instruments: vec![instrument::instrument(&knife(), 0)], ..open(session, &[0]) };
     let mut touch = TestTouch::open(&server, with_knife(&session)).await.unwrap();
