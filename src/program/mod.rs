@@ -7,6 +7,7 @@ pub(crate) mod fit;
 pub(crate) mod indent;
 pub(crate) mod journal;
 mod log;
+mod markup;
 pub(crate) mod mesh;
 pub(crate) mod organ;
 pub(crate) mod render;

@@ -48,9 +48,6 @@ impl Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        if let Some(Source::Journal(moment)) = &request.source {
-            self.0.check_not_for_trainee(&moment.session_id)?;
-        }
         // Reading and compiling a large tissue takes a while.
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
@@ -138,13 +135,13 @@ impl SessionService for Sessions {
         if self.0.fleet.is_some() {
             exercises::check_no_fleet(&request)?;
         }
-        if let Some(pb::create_session_request::Source::Journal(moment)) = &request.source
-            && !may_see_hidden
-        {
+        if let Some(pb::create_session_request::Source::Journal(moment)) = &request.source {
             self.0.check_not_for_trainee(&moment.session_id)?;
-            let (recorded, payer, moment) = (self.0.recorded.clone(), account.clone(), moment.clone());
-            let check = move |_: &CancelFlag| recorded.check_hides_nothing(&moment, &payer);
-            self.0.job_pool.work(&account, check).await??;
+            if !may_see_hidden {
+                let (recorded, payer, moment) = (self.0.recorded.clone(), account.clone(), moment.clone());
+                let check = move |_: &CancelFlag| recorded.check_hides_nothing(&moment, &payer);
+                self.0.job_pool.work(&account, check).await??;
+            }
         }
         if let Some(fleet) = &self.0.fleet
             && let Some(created) = fleet.create_elsewhere(&request, &account).await

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use palpate_fitting::curve_file::{MeasuredCurve, UsualTip, read_curves};
 use palpate_fitting::fit::{FitOptions, fit as fit_curves};
 use palpate_haptics::TipShape;
-use palpate_refusal::{Reason, Refusal};
 use palpate_session::press::ImposedPress;
 use palpate_tissue::files;
 use palpate_tissue::scene::Named;
@@ -15,6 +14,7 @@ use pyo3::types::{PyDict, PyList};
 
 use crate::arrays::{column, shaped, vector};
 use crate::error::{of_run, refused, wrong};
+use crate::run::thread_count;
 use crate::scene::{Scene, Tissue, limits};
 use crate::waiting::work;
 
@@ -71,11 +71,7 @@ pub(crate) fn fit<'py>(
     let curves = curves_of(curves)?;
     let named = |name: &String| TissueParameter::named("parameters", name).map_err(refused);
     let parameters = parameters.unwrap_or_default().iter().map(named).collect::<PyResult<Vec<_>>>()?;
-    let threads = match threads {
-        Some(0) => return Err(refused(Refusal::new(Reason::OutOfRange, "threads", "must be 1 or more"))),
-        Some(threads) => threads,
-        None => std::thread::available_parallelism().map_or(1, Into::into),
-    };
+    let threads = thread_count(threads)?;
     let limits = limits();
     let found = work(py, |stop| {
         let options = FitOptions { parameters: &parameters, threads, limits: &limits, stop };

@@ -194,13 +194,7 @@ pub(crate) fn study<'py>(
         })
         .collect();
     let cases = cases?;
-    let threads = match threads {
-        Some(0) => {
-            return Err(refused(Refusal::new(Reason::OutOfRange, "threads", "must be 1 or more")));
-        }
-        Some(threads) => threads,
-        None => std::thread::available_parallelism().map_or(1, Into::into),
-    };
+    let threads = thread_count(threads)?;
     let mut found: Vec<Option<Result<RunRecord, SimulationFailure>>> = Vec::new();
     found.resize_with(cases.len(), || None);
     let progress = progress.map(Bound::unbind);
@@ -266,6 +260,15 @@ pub(crate) fn study<'py>(
         Err(failure) => Ok(of_run(failure).into_value(py).into_bound(py).into_any()),
     });
     PyList::new(py, given.collect::<PyResult<Vec<_>>>()?)
+}
+
+/// Returns the number of threads for work that is spread over them: that of cores if none is given.
+pub(crate) fn thread_count(threads: Option<usize>) -> PyResult<usize> {
+    match threads {
+        Some(0) => Err(refused(Refusal::new(Reason::OutOfRange, "threads", "must be 1 or more"))),
+        Some(threads) => Ok(threads),
+        None => Ok(std::thread::available_parallelism().map_or(1, Into::into)),
+    }
 }
 
 /// Returns whether a run failed by itself.

@@ -1,23 +1,19 @@
 // What a trainee sees after an exercise: the score, what earned it, all figures, and on the tissue what was hidden beside what was marked.
 
+import { vec } from "palpate";
 import { type EarnedCriterion, type ExerciseResult, type Figure } from "palpate/v1";
 import { figureRow, measureTitle, timeText, valueText } from "./figure-text";
 import type { Lump } from "./lumps";
-import { part } from "./page";
+import { element, part } from "./page";
 
 /** Radius of an answer that has no size, m. */
 const MARK_M = 0.003;
 
 /** Returns a table with a heading and rows of cells. */
 function table(heading: readonly string[], rows: readonly (readonly string[])[]): HTMLTableElement {
-  const made = document.createElement("table");
+  const made = element("table");
   const head = made.createTHead().insertRow();
-  for (const title of heading) {
-    const cell = document.createElement("th");
-    cell.scope = "col";
-    cell.textContent = title;
-    head.append(cell);
-  }
+  for (const title of heading) head.append(element("th", { scope: "col", textContent: title }));
   const body = made.createTBody();
   for (const cells of rows) {
     const row = body.insertRow();
@@ -35,13 +31,13 @@ function criterionRow({ measure, weight, value, earned }: EarnedCriterion, figur
 
 /** Returns what was hidden. */
 export function hiddenIn({ lumps }: ExerciseResult): Lump[] {
-  return lumps.map(({ centreM, radiusM }) => ({ centreM: [centreM?.x ?? 0, centreM?.y ?? 0, centreM?.z ?? 0], radiusM }));
+  return lumps.map(({ centreM, radiusM }) => ({ centreM: vec(centreM), radiusM }));
 }
 
 /** Returns what was marked. */
 export function markedIn({ answers }: ExerciseResult): Lump[] {
   return answers.map(({ placeM, diameterM }) => ({
-    centreM: [placeM?.x ?? 0, placeM?.y ?? 0, placeM?.z ?? 0],
+    centreM: vec(placeM),
     radiusM: diameterM === undefined ? MARK_M : diameterM / 2,
   }));
 }
@@ -80,8 +76,8 @@ export class Debriefing {
     const tables = [];
     if (criteria.length > 0) tables.push(table(["Criterion", "Value", "Points"], criteria.map((each) => criterionRow(each, figures))));
     if (all.length > 0) {
-      const more = document.createElement("details");
-      more.append(Object.assign(document.createElement("summary"), { textContent: "All figures" }), table(["Measure", "Value"], all));
+      const more = element("details");
+      more.append(element("summary", { textContent: "All figures" }), table(["Measure", "Value"], all));
       tables.push(more);
     }
     part("debriefing-tables", HTMLElement).replaceChildren(...tables);

@@ -3,9 +3,10 @@
 // The page asks for the figures once in a while, with a stream that it ends after the first message: without TLS a browser has six
 // connections, and the page's other streams need them (main.ts).
 
+import { vec } from "palpate";
 import { type Advice, type ExerciseResult, ExerciseRole, type SessionExercise, SessionState, type WatchExerciseResponse } from "palpate/v1";
 import { Debriefing, hiddenIn, markedIn } from "./debriefing";
-import { figureRow, timeText } from "./figure-text";
+import { figureRow, listed, timeText } from "./figure-text";
 import type { Input } from "./input";
 import type { Lump } from "./lumps";
 import { part } from "./page";
@@ -134,10 +135,7 @@ export class ExercisePanel {
     const rows: [string, string][] = [];
     if (exercise?.timeLimitS !== undefined) rows.push(["Time", timeText(exercise.timeLimitS)]);
     if (exercise?.forceLimitN !== undefined) rows.push(["Force", `at most ${quantity(exercise.forceLimitN, "N")}`]);
-    return rows.flatMap(([name, value]) => [
-      Object.assign(document.createElement("dt"), { textContent: name }),
-      Object.assign(document.createElement("dd"), { textContent: value }),
-    ]);
+    return listed(rows);
   }
 
   private async begin(): Promise<void> {
@@ -174,12 +172,7 @@ export class ExercisePanel {
   private tell({ timeS, figures, scorePercent, advice, result }: WatchExerciseResponse): void {
     this.tellTime(timeS);
     const rows = figures.filter(({ tool }) => tool === undefined).map(figureRow);
-    part("exercise-figures", HTMLElement).replaceChildren(
-      ...rows.flatMap(([name, value]) => [
-        Object.assign(document.createElement("dt"), { textContent: name }),
-        Object.assign(document.createElement("dd"), { textContent: value }),
-      ]),
-    );
+    part("exercise-figures", HTMLElement).replaceChildren(...listed(rows));
     part("exercise-score", HTMLElement).textContent = scorePercent === undefined ? "none" : `${Math.round(scorePercent)} %`;
     const fresh = advice.filter(({ number }) => number > this.advised);
     if (fresh.length > 0) this.tellAdvice(advice, fresh);
@@ -202,7 +195,7 @@ export class ExercisePanel {
     }
     if (this.isTrainee) this.host.notice(text === "" ? "Your trainer points at a place." : `Your trainer: ${excerpt(text)}`, 10);
     const radiusM = MARKER * (this.of?.surface.sizeM ?? 0);
-    this.markers = all.flatMap(({ placeM }) => (placeM ? [{ centreM: [placeM.x, placeM.y, placeM.z] as const, radiusM }] : []));
+    this.markers = all.flatMap(({ placeM }) => (placeM ? [{ centreM: vec(placeM), radiusM }] : []));
     this.draw();
   }
 

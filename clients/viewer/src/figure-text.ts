@@ -1,6 +1,7 @@
 // Figures of an exercise as people read them.
 
 import type { Figure } from "palpate/v1";
+import { element } from "./page";
 import { quantity } from "./plot";
 import { excerpt } from "./text";
 
@@ -27,6 +28,11 @@ export function valueText(measure: string, value: number, unit: string): string 
 /** Returns a row with the title and the value of a figure. */
 export function figureRow({ measure, value, unit, tool }: Figure): [string, string] {
   return [measureTitle(measure) + (tool === undefined ? "" : `, tool ${tool}`), valueText(measure, value, unit)];
+}
+
+/** Returns rows of titles and values as the terms of a list. */
+export function listed(rows: readonly (readonly [string, string])[]): HTMLElement[] {
+  return rows.flatMap(([title, value]) => [element("dt", { textContent: title }), element("dd", { textContent: value })]);
 }
 
 /** Returns a time as minutes and seconds. */

@@ -9,6 +9,11 @@ export function part<T extends HTMLElement>(id: string, kind: new () => T): T {
   return element;
 }
 
+/** Makes an element. */
+export function element<K extends keyof HTMLElementTagNameMap>(kind: K, of: Partial<HTMLElementTagNameMap[K]> = {}): HTMLElementTagNameMap[K] {
+  return Object.assign(document.createElement(kind), of);
+}
+
 export const asked = new URLSearchParams(location.search);
 
 /** An integer parameter of the address, if it is within the range. */

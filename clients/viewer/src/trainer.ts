@@ -3,7 +3,7 @@
 
 import { type Session, SessionState, type WatchExerciseResponse } from "palpate/v1";
 import { figureRow, timeText } from "./figure-text";
-import { part, withSession } from "./page";
+import { element, part, withSession } from "./page";
 import { CALL_TIMEOUT_MS, describe, exerciseNow, exercises, isGone, sessions, sleep } from "./server";
 import { excerpt } from "./text";
 
@@ -54,10 +54,6 @@ function keep(): void {
 
 function say(text: string): void {
   part("said", HTMLElement).textContent = excerpt(text);
-}
-
-function element<K extends keyof HTMLElementTagNameMap>(kind: K, of: Partial<HTMLElementTagNameMap[K]> = {}): HTMLElementTagNameMap[K] {
-  return Object.assign(document.createElement(kind), of);
 }
 
 /** A trainee in the list. */

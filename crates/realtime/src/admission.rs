@@ -128,30 +128,13 @@ impl Pacer {
     /// - `stop` is set.
     pub fn create_as(
         &self,
-        SessionReservation { id, revision, recorded }: SessionReservation,
+        reservation: SessionReservation,
         scene: &Scene,
-        (paused, idle_timeout_s): (bool, f64),
+        how: (bool, f64),
         owner: &Account,
         stop: &AtomicBool,
     ) -> Result<Arc<SessionHandle>> {
-        // Taken before any work is done for it.
-        let slot = owner.take(Resource::Sessions, 1, "")?;
-        let model = self.model_of(scene, stop)?;
-        let begin = Begin {
-            id,
-            first: model.clone(),
-            running: !paused,
-            until: None,
-            idle_timeout_s,
-            playback: None,
-            after_run: 0,
-            revision,
-            waiting: Vec::new(),
-            frozen: false,
-            recorded,
-            exercise: None,
-        };
-        self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
+        self.create_for(None, reservation, scene, how, owner, stop)
     }
 
     /// Creates a session for an exercise, as [`Pacer::create_as`] does. `scene` has the exercise's truth in it.
@@ -163,14 +146,30 @@ impl Pacer {
         reservation: SessionReservation,
         scene: &Scene,
         chosen: ChosenExercise,
+        how: (bool, f64),
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<SessionHandle>> {
+        self.create_for(Some(chosen), reservation, scene, how, owner, stop)
+    }
+
+    fn create_for(
+        &self,
+        chosen: Option<ChosenExercise>,
+        SessionReservation { id, revision, recorded }: SessionReservation,
+        scene: &Scene,
         (paused, idle_timeout_s): (bool, f64),
         owner: &Account,
         stop: &AtomicBool,
     ) -> Result<Arc<SessionHandle>> {
+        // Taken before any work is done for it.
         let slot = owner.take(Resource::Sessions, 1, "")?;
         let model = self.model_of(scene, stop)?;
-        let plain = self.plain_of(&chosen, &model, stop)?;
-        let SessionReservation { id, revision, recorded } = reservation;
+        let of_exercise = |chosen: ChosenExercise| {
+            let plain = self.plain_of(&chosen, &model, stop)?;
+            Ok(SessionExercise { chosen, trainee_id: random_id()?, plain, ended: None })
+        };
+        let exercise = chosen.map(of_exercise).transpose()?;
         let begin = Begin {
             id,
             first: model.clone(),
@@ -183,7 +182,7 @@ impl Pacer {
             waiting: Vec::new(),
             frozen: false,
             recorded,
-            exercise: Some(SessionExercise { chosen, trainee_id: random_id()?, plain, ended: None }),
+            exercise,
         };
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
     }

@@ -81,16 +81,19 @@ impl ImposedPress {
             let range = format!("reached with at most {SPEED_M_PER_S} m/s");
             number(&field, speed_m_per_s, &range, |speed| speed <= SPEED_M_PER_S)?;
         }
-        let lasts_s = self.time_s[times - 1] - self.time_s[0];
-        number("time_s", lasts_s, &format!("{LONGEST_S} s in all at most"), |lasts_s| lasts_s <= LONGEST_S)?;
+        number("time_s", self.lasts_s(), &format!("{LONGEST_S} s in all at most"), |lasts_s| lasts_s <= LONGEST_S)?;
         Ok(())
     }
 
     /// Returns the number of steps at a rate (Hz).
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn steps(&self, rate_hz: f64) -> u64 {
-        let lasts_s = self.time_s.last().zip(self.time_s.first()).map_or(0.0, |(last, first)| last - first);
-        ((self.lead_s() + lasts_s) * rate_hz).ceil() as u64
+        ((self.lead_s() + self.lasts_s()) * rate_hz).ceil() as u64
+    }
+
+    /// Returns the time from the first sample to the last, s.
+    fn lasts_s(&self) -> f64 {
+        self.time_s.last().zip(self.time_s.first()).map_or(0.0, |(last, first)| last - first)
     }
 
     /// Returns the time before the first sample, s.

@@ -3,7 +3,8 @@
 use std::fmt::Write as _;
 
 use palpate_fitting::curve_file::MeasuredCurve;
-use palpate_refusal::printable::printable;
+
+use super::super::markup::{escaped, mark_distance};
 
 /// Curves that are drawn, at most: each is a row.
 const MAX_CURVES: usize = 24;
@@ -74,16 +75,7 @@ pub(super) fn svg(curves: &[MeasuredCurve], fitted_n: &[Vec<f64>]) -> String {
 fn range(values: impl Iterator<Item = f64>) -> ([f64; 2], f64) {
     let [low, high] = values.fold([0.0_f64, 0.0_f64], |[low, high], value| [low.min(value), high.max(value)]);
     let span = if high > low { high - low } else { 1.0 };
-    let rough = span / 5.0;
-    let power = 10.0_f64.powf(rough.log10().floor());
-    let step =
-        [1.0, 2.0, 5.0, 10.0].map(|times| times * power).into_iter().find(|step| *step >= rough).unwrap_or(rough);
-    ([low - 0.03 * span, low + 1.03 * span], step)
-}
-
-/// Returns a text without what SVG reads as markup.
-fn escaped(text: &str) -> String {
-    printable(text).replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+    ([low - 0.03 * span, low + 1.03 * span], mark_distance(span, 5.0))
 }
 
 impl Panel<'_> {

@@ -7,9 +7,9 @@ use base64::engine::general_purpose::STANDARD;
 use palpate::render::{MAP_COLOURS, STRONG, pressed_map};
 use palpate_exercise::timeline::Timeline;
 use palpate_exercise::{MeasureDefinition, Measures, register};
-use palpate_refusal::printable::printable;
 
 use super::super::Failure;
+use super::super::markup::{escaped, mark_distance};
 use super::{Score, ScoredCrossing, shown};
 
 /// Size of the curves, pixels, with the room for the labels of the axes.
@@ -38,21 +38,6 @@ const STYLE: &str = "body{font:15px/1.45 system-ui,sans-serif;color:#1c1c1c;back
     .key{display:inline-block;width:1em;height:1em;vertical-align:-.15em;margin:0 .3em 0 1em;border:1px solid #999}\
     svg{width:100%;height:auto}svg text{font:12px system-ui,sans-serif;fill:#444}\
     @media print{body{margin:0;max-width:none;font-size:11px}h2,figure,svg{break-after:avoid;break-inside:avoid}tr{break-inside:avoid}}";
-
-/// Returns a text without what HTML would act on.
-fn escaped(text: &str) -> String {
-    let mut safe = String::new();
-    for letter in printable(text).chars() {
-        match letter {
-            '&' => safe += "&amp;",
-            '<' => safe += "&lt;",
-            '>' => safe += "&gt;",
-            '"' => safe += "&quot;",
-            other => safe.push(other),
-        }
-    }
-    safe
-}
 
 /// Returns the score of the exercise, and the truth beside the answers; nothing without an exercise.
 fn exercise(score: &Score) -> String {
@@ -150,14 +135,6 @@ fn figures(score: &Score) -> String {
         let _ = writeln!(html, "<td>{unit}</td><td>{}</td></tr>", escaped(meaning));
     }
     html + "</table>\n"
-}
-
-/// Returns a round distance between about `count` marks of an axis up to `most`.
-fn mark_distance(most: f64, count: f64) -> f64 {
-    let rough = most / count;
-    let power = libm::pow(10.0, rough.log10().floor());
-    let steps = [1.0, 2.0, 5.0, 10.0];
-    power * steps.into_iter().find(|step| step * power >= rough).unwrap_or(10.0)
 }
 
 #[allow(clippy::cast_precision_loss)]

@@ -50,7 +50,7 @@ impl Tool {
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         self.normal = self.footprint.outward(&along);
         self.side = Some(1.0);
-        let depth_m = depth_m(surface_m - place_m, self.normal, edge).min(length_m);
+        let depth_m = along_edge(surface_m - place_m, self.normal, edge).min(length_m);
         // Across the edge from the middle of the disc: where an edge leans on the surface, that is not where it leaves it.
         self.pierced_m = (surface_m - place_m).dot(edge);
         let most_n = model.scene.cutting.resistance_n(depth_m);
@@ -79,8 +79,7 @@ impl Tool {
         let Coupling::Spring { stiffness_n_per_m, .. } = COUPLING else { return thrust };
         let lag_m = most_n / stiffness_n_per_m;
         // Over the surface, to where the edge leaves it farther on.
-        let slope = edge.dot(self.normal).max(MIN_SLOPE);
-        let over = ahead - ahead.dot(self.normal) / slope * edge;
+        let over = ahead - along_edge(ahead, self.normal, edge) * edge;
         let most_m = self.footprint.stride_m() / over.length();
         let slid_m = (across_m.dot(ahead) - lag_m).max(0.0).min(most_m);
         self.footprint.shift(model, slid_m * over, &along);
@@ -103,7 +102,7 @@ impl Tool {
         for _ in 0..MAX_SEEKS {
             self.footprint.seek(model, sought_m, true, displacement_m);
             let (surface_m, along) = self.footprint.surface(displacement_m);
-            let depth_m = depth_m(surface_m - place_m, self.footprint.outward(&along), edge).clamp(0.0, length_m);
+            let depth_m = along_edge(surface_m - place_m, self.footprint.outward(&along), edge).clamp(0.0, length_m);
             let pierced_m = place_m + depth_m * edge;
             let is_found = pierced_m.distance(sought_m) < NEAR * self.footprint.radius_m();
             if depth_m == 0.0 || is_found {
@@ -114,8 +113,8 @@ impl Tool {
     }
 }
 
-/// Returns how deep the tip of a blade is beneath the plane that touches the surface at the way `surface_m` from it, along its edge; below
-/// 0 above the plane.
-fn depth_m(surface_m: DVec3, outward: DVec3, edge: DVec3) -> f64 {
-    surface_m.dot(outward) / edge.dot(outward).max(MIN_SLOPE)
+/// Returns how far a way leads out of the planes that touch the surface, measured along an edge: for the way from a blade's tip to the
+/// surface, how deep the tip is, and less than 0 above it.
+fn along_edge(way: DVec3, outward: DVec3, edge: DVec3) -> f64 {
+    way.dot(outward) / edge.dot(outward).max(MIN_SLOPE)
 }
