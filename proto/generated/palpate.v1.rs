@@ -7570,6 +7570,9 @@ pub struct GetMeshResponse {
     /// with an equal name continues it.
     #[prost(message, repeated, tag = "9")]
     pub groups: ::prost::alloc::vec::Vec<VertexGroup>,
+    /// For a solid: the number of rows that WatchFramesRequest.cut_surface adds to a frame, for the vertices of the surface within cuts.
+    #[prost(uint32, tag = "10")]
+    pub cut_rows: u32,
 }
 impl ::prost::Name for GetMeshResponse {
     const NAME: &'static str = "GetMeshResponse";
@@ -7686,6 +7689,9 @@ pub struct GetWoundRequest {
     /// The version whose wound the client has: then only what is new since, if that is all that has changed. 0: everything.
     #[prost(uint32, tag = "3")]
     pub since_version: u32,
+    /// Whether the answer has the surface within the cuts of a solid. Its vertices are in frames of WatchFramesRequest.cut_surface.
+    #[prost(bool, tag = "4")]
+    pub cut_surface: bool,
 }
 impl ::prost::Name for GetWoundRequest {
     const NAME: &'static str = "GetWoundRequest";
@@ -7725,6 +7731,11 @@ pub struct GetWoundResponse {
     /// Whether this is the last part.
     #[prost(bool, tag = "9")]
     pub last: bool,
+    /// The surface within the cuts of a solid, if it was requested: what is new or has changed.
+    #[prost(message, repeated, tag = "10")]
+    pub cut_vertices: ::prost::alloc::vec::Vec<CutVertex>,
+    #[prost(message, repeated, tag = "11")]
+    pub cut_faces: ::prost::alloc::vec::Vec<CutFace>,
 }
 impl ::prost::Name for GetWoundResponse {
     const NAME: &'static str = "GetWoundResponse";
@@ -7734,6 +7745,51 @@ impl ::prost::Name for GetWoundResponse {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.GetWoundResponse".into()
+    }
+}
+/// A vertex of the surface within the cuts of a solid. Its displacement is at index vertices_x·vertices_y + number of a frame, of vertices_x
+/// and vertices_y in GetMesh.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct CutVertex {
+    /// From 0, without gaps. What a client was sent before with the same number is replaced.
+    #[prost(uint32, tag = "1")]
+    pub number: u32,
+    /// Its rest position.
+    #[prost(float, tag = "2")]
+    pub rest_x_m: f32,
+    #[prost(float, tag = "3")]
+    pub rest_y_m: f32,
+    #[prost(float, tag = "4")]
+    pub rest_z_m: f32,
+}
+impl ::prost::Name for CutVertex {
+    const NAME: &'static str = "CutVertex";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.CutVertex".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.CutVertex".into()
+    }
+}
+/// A side of a face between two cells of a solid that a cut has severed.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CutFace {
+    /// Numbers are unique; there may be gaps. What a client was sent before with the same number is replaced.
+    #[prost(uint32, tag = "1")]
+    pub number: u32,
+    /// The numbers of its four vertices, counter-clockwise seen from within the cut.
+    #[prost(uint32, repeated, tag = "2")]
+    pub corners: ::prost::alloc::vec::Vec<u32>,
+}
+impl ::prost::Name for CutFace {
+    const NAME: &'static str = "CutFace";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.CutFace".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.CutFace".into()
     }
 }
 /// A vertex of a lip of the wound. It moves as its host does: its position is its rest position plus the displacement of the host.
@@ -7848,6 +7904,9 @@ pub struct WatchFramesRequest {
     /// sent, and writes the patches of each frame over them.
     #[prost(bool, tag = "6")]
     pub always_full: bool,
+    /// Whether frames of a solid have the vertices of the surface within cuts: GetMeshResponse.cut_rows more rows.
+    #[prost(bool, tag = "7")]
+    pub cut_surface: bool,
 }
 impl ::prost::Name for WatchFramesRequest {
     const NAME: &'static str = "WatchFramesRequest";

@@ -37,4 +37,6 @@ pub(super) struct DrawnWound {
     pub(super) bed_m: Vec<[DVec3; 3]>,
     /// The ends of the lines along both lips, by the vertices of the surface.
     pub(super) lips: Vec<[usize; 2]>,
+    /// The triangles of the surface within the cuts of a solid, which has no bed.
+    pub(super) within: Vec<[Vertex; 3]>,
 }

@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::drawn_surface::{DrawnSurface, DrawnWound, Vertex};
-use super::wound::open_wound;
+use super::wound::{open_wound, show_within};
 use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, Wound, encode};
 use palpate_tissue::shape::RestShape;
 
@@ -32,7 +32,7 @@ impl DrawnSurface {
         wound: Option<&Wound>,
         refinement: Refinement,
     ) -> Self {
-        let moved_m = displacements(snapshot, refinement);
+        let moved_m = displacements(snapshot, skin.with_cut_surface(refinement));
         let (least_m, longest_m) = (shape.extent().least_m, shape.longest_side_m());
         let rest_m: Vec<DVec3> = skin.vertices().iter().map(|vertex| skin.rest_m(*vertex)).collect();
         let places_m: Vec<DVec3> = rest_m.iter().zip(&moved_m).map(|(rest_m, moved_m)| *rest_m + *moved_m).collect();
@@ -70,6 +70,10 @@ impl DrawnSurface {
         let mut surface = DrawnSurface { vertices, triangles, lines, along, wound: DrawnWound::default() };
         if let Some(wound) = wound {
             open_wound(&mut surface, wound, |place| rest_m[place], shape.edge_m());
+        }
+        let within = skin.cut_surface(snapshot.cuts());
+        if !within.faces.is_empty() {
+            show_within(&mut surface, &within, &moved_m[skin.first_cut_place()..], |at_m| (at_m - least_m) / longest_m);
         }
         let facing = |place: usize| match wound.and_then(|wound| wound.vertices.get(place.checked_sub(rest_m.len())?)) {
             Some(lip) => at_rest[lip.host as usize].abs(),

@@ -1,10 +1,11 @@
 //! The wound of a drawn surface: its split triangles, both lips as dark lines, and dark tissue beneath them.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::drawn_surface::{DrawnSurface, DrawnWound, Vertex};
 use palpate_session::surface::Wound;
 use palpate_session::surface::wound::LipVertex;
+use palpate_tissue::CutSurface;
 
 /// How far beneath the surface the dark tissue is drawn, as a fraction of the distance of neighbouring points.
 const DEPTH: f64 = 0.5;
@@ -28,7 +29,39 @@ pub(super) fn open_wound(surface: &mut DrawnSurface, wound: &Wound, rest_m: impl
     if !wound.triangles.is_empty() {
         draw_lines(surface, wound);
     }
-    surface.wound = DrawnWound { bed_m, lips };
+    surface.wound = DrawnWound { bed_m, lips, within: Vec::new() };
+}
+
+/// Shows the surface within the cuts of a solid in place of the tissue beneath the lips. `moved_m` has the displacements of its vertices, m;
+/// `share` returns a rest position as a part of the longest side.
+pub(super) fn show_within(
+    surface: &mut DrawnSurface,
+    within: &CutSurface,
+    moved_m: &[DVec3],
+    share: impl Fn(DVec3) -> DVec3,
+) {
+    let at = |corner: u32| {
+        let rest_m = within.vertices[corner as usize].rest_m;
+        (rest_m, rest_m + moved_m.get(corner as usize).copied().unwrap_or_default())
+    };
+    let triangles = within.faces.iter().flat_map(|face| {
+        let [a, b, c, d] = face.corners.map(at);
+        [[a, b, c], [a, c, d]]
+    });
+    let normal = |[a, b, c]: [DVec3; 3]| (b - a).cross(c - a).normalize_or(DVec3::Z);
+    let drawn = triangles.map(|corners| {
+        let (facing, now) = (normal(corners.map(|(rest_m, _)| rest_m)), normal(corners.map(|(_, at_m)| at_m)));
+        corners.map(|(rest_m, at_m)| Vertex {
+            at_m,
+            normal: now,
+            share: DVec2::ZERO,
+            rest: share(rest_m),
+            facing: facing.abs(),
+            open: 1.0,
+        })
+    });
+    surface.wound.within = drawn.collect();
+    surface.wound.bed_m.clear();
 }
 
 /// Returns a vertex of a lip. It is as far from its host as at rest, and looks like that place of the surface.

@@ -68,6 +68,7 @@ fn part_of_mesh(skin: &Skin, part: usize) -> Option<pb::GetMeshResponse> {
         vertices_y: MESH_ROW as u32,
         vertex_spacing_m: skin.edge_m(),
         groups: groups(skin.groups(), part),
+        cut_rows: skin.cut_rows() as u32,
         last: part + 1 == parts,
         ..Default::default()
     };

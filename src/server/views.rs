@@ -119,11 +119,11 @@ impl ViewService for Views {
 
     async fn get_wound(&self, request: Request<pb::GetWoundRequest>) -> Result<Response<Self::GetWoundStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let pb::GetWoundRequest { session_id, refinement, since_version } = request.into_inner();
-        let handle = self.0.seat("GetWound", &session_id).await?.handle;
-        let grid = Refinement::new(&handle.model.scene, refinement, &self.0.config.limits)?;
+        let request = request.into_inner();
+        let handle = self.0.seat("GetWound", &request.session_id).await?.handle;
+        let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
         let guard = handle.open_stream("GetWound", StreamKind::ReadsOnly, &account)?;
-        let parts = move |_: &CancelFlag| WoundParts::new(&handle, grid, since_version);
+        let parts = move |_: &CancelFlag| WoundParts::new(&handle, grid, &request);
         let parts = self.0.job_pool.work(&account, parts).await?;
         Ok(Response::new(in_parts(parts, guard, WoundParts::next)))
     }
@@ -158,7 +158,10 @@ impl ViewService for Views {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let handle = self.0.seat("WatchFrames", &request.session_id).await?.handle;
-        let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
+        let mut grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
+        if let Some(skin) = handle.skin.as_ref().filter(|_| request.cut_surface) {
+            grid = skin.with_cut_surface(grid);
+        }
         let encoding = wire::sample::from_encoding(request.encoding)?;
         let most_hz = handle.model.scene.stepping.rate_hz;
         let rate_hz = request.rate_hz.unwrap_or(DEFAULT_RATE_HZ.min(most_hz));

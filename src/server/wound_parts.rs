@@ -4,6 +4,7 @@ use palpate_proto::pb;
 use palpate_realtime::SessionHandle;
 use palpate_session::surface::wound::{CutTriangles, LipVertex, Wound};
 use palpate_session::surface::{Refinement, Skin};
+use palpate_tissue::{CutFace, CutVertex};
 
 /// Number of new vertices and of changed runs of triangles in a message: about 100 KiB.
 const ENTRIES_PER_MESSAGE: usize = 2048;
@@ -14,11 +15,14 @@ pub(super) struct WoundParts {
     common: pb::GetWoundResponse,
     vertices: std::vec::IntoIter<LipVertex>,
     triangles: std::vec::IntoIter<CutTriangles>,
+    cut_vertices: std::vec::IntoIter<pb::CutVertex>,
+    cut_faces: std::vec::IntoIter<pb::CutFace>,
 }
 
 impl WoundParts {
-    /// Splits the surface as frames of `refinement` show it now, less what a client knows that has the wound of version `since_version`.
-    pub(super) fn new(handle: &SessionHandle, refinement: Refinement, since_version: u32) -> Self {
+    /// Splits the surface as frames of `refinement` show it now, less what the client knows.
+    pub(super) fn new(handle: &SessionHandle, refinement: Refinement, request: &pb::GetWoundRequest) -> Self {
+        let pb::GetWoundRequest { since_version, cut_surface, .. } = *request;
         let status = handle.status();
         let (cuts, model) = (&status.cuts, &status.model);
         let skin: Option<&Skin> = handle.skin.as_deref();
@@ -39,17 +43,45 @@ impl WoundParts {
             stays_whole,
             ..Default::default()
         };
-        WoundParts { common, vertices: wound.vertices.into_iter(), triangles: wound.triangles.into_iter() }
+        let cut_surface = skin.filter(|_| cut_surface).map(|skin| skin.cut_surface(cuts)).unwrap_or_default();
+        let known = if continues { since_version } else { 0 };
+        let cut_vertices: Vec<_> = cut_surface.vertices_since(known).map(cut_vertex).collect();
+        let cut_faces: Vec<_> = cut_surface.faces_since(known).map(cut_face).collect();
+        WoundParts {
+            common,
+            vertices: wound.vertices.into_iter(),
+            triangles: wound.triangles.into_iter(),
+            cut_vertices: cut_vertices.into_iter(),
+            cut_faces: cut_faces.into_iter(),
+        }
     }
 
     /// Returns the next message, and whether it is the last, which has `last` set.
     pub(super) fn next(&mut self) -> (pb::GetWoundResponse, bool) {
-        let vertices: Vec<_> = self.vertices.by_ref().take(ENTRIES_PER_MESSAGE).map(lip_vertex).collect();
-        let room = ENTRIES_PER_MESSAGE - vertices.len();
-        let triangles: Vec<_> = self.triangles.by_ref().take(room).map(cut_triangles).collect();
-        let last = self.vertices.len() == 0 && self.triangles.len() == 0;
-        (pb::GetWoundResponse { vertices, triangles, last, ..self.common.clone() }, last)
+        let mut room = ENTRIES_PER_MESSAGE;
+        let vertices: Vec<_> = taken(&mut self.vertices, &mut room).map(lip_vertex).collect();
+        let triangles: Vec<_> = taken(&mut self.triangles, &mut room).map(cut_triangles).collect();
+        let cut_vertices: Vec<_> = taken(&mut self.cut_vertices, &mut room).collect();
+        let cut_faces: Vec<_> = taken(&mut self.cut_faces, &mut room).collect();
+        let last = [self.vertices.len(), self.triangles.len(), self.cut_vertices.len(), self.cut_faces.len()] == [0; 4];
+        (pb::GetWoundResponse { vertices, triangles, cut_vertices, cut_faces, last, ..self.common.clone() }, last)
     }
+}
+
+/// Takes as many entries as there is room for, which it takes up.
+fn taken<T>(entries: &mut std::vec::IntoIter<T>, room: &mut usize) -> impl Iterator<Item = T> {
+    let count = entries.len().min(*room);
+    *room -= count;
+    entries.take(count)
+}
+
+fn cut_vertex((number, vertex): (u32, &CutVertex)) -> pb::CutVertex {
+    let [rest_x_m, rest_y_m, rest_z_m] = vertex.rest_m.as_vec3().to_array();
+    pb::CutVertex { number, rest_x_m, rest_y_m, rest_z_m }
+}
+
+fn cut_face(face: &CutFace) -> pb::CutFace {
+    pb::CutFace { number: face.number, corners: face.corners.to_vec() }
 }
 
 fn lip_vertex(vertex: LipVertex) -> pb::LipVertex {

@@ -37,11 +37,13 @@ export class Field {
   /** Bounds of all changes since the last `takeChanged`. */
   private changed: Rectangle | undefined;
 
+  /** `cutRows` of the nx rows are for the vertices of the surface within cuts (`MeshData.cutRows`). */
   constructor(
     readonly nx: number,
     readonly ny: number,
+    readonly cutRows = 0,
   ) {
-    const isWhole = [nx, ny].every((count) => Number.isInteger(count) && count >= 0);
+    const isWhole = [nx, ny, cutRows, nx - cutRows].every((count) => Number.isInteger(count) && count >= 0);
     if (!isWhole || nx * ny > MAX_VERTICES) throw new RangeError(`a surface of ${nx} × ${ny} vertices can't be shown`);
     this.displacementM = new Float32Array(3 * nx * ny);
   }

@@ -22,8 +22,8 @@ export class Frames {
 
   /**
    * Receives the frames of a session into `field` until `signal` aborts; then the worker and its stream end. For a
-   * mesh, the field needs the dimensions of its `MeshData`; for a sheet, (m − 1)·n + m vertices along a side of m
-   * points at refinement n.
+   * mesh, the field needs the dimensions of its `MeshData`, with its `cutRows` more rows to receive the surface within
+   * cuts as well; for a sheet, (m − 1)·n + m vertices along a side of m points at refinement n.
    */
   run(
     sessionId: string,
@@ -47,7 +47,7 @@ export class Frames {
       this.onFrame(this.newest);
     };
     worker.onerror = (event) => onFailure({ isGone: false, reason: "", text: event.message || "can't receive frames" }, 0);
-    const vertices: [number, number] = [field.nx, field.ny];
+    const vertices: [number, number, number] = [field.nx, field.ny, field.cutRows];
     const { url, token } = this.server;
     worker.postMessage({ url, token, sessionId, refinement, vertices } satisfies Order);
   }

@@ -16,6 +16,8 @@ export interface MeshData {
   fileVertex: Uint32Array<ArrayBuffer>;
   /** Typical edge length, m. */
   edgeM: number;
+  /** Number of further rows of a frame, for the vertices of the surface within the cuts of a solid. */
+  cutRows: number;
 }
 
 /** Concatenates the parts of an array. */
@@ -32,7 +34,7 @@ function joined<A extends Float32Array<ArrayBuffer> | Uint32Array<ArrayBuffer>>(
 /** The fields of a part that are used. */
 type Part = Pick<
   GetMeshResponse,
-  "restPositionM" | "textureCoordinates" | "triangles" | "fileVertex" | "verticesX" | "verticesY" | "vertexSpacingM"
+  "restPositionM" | "textureCoordinates" | "triangles" | "fileVertex" | "verticesX" | "verticesY" | "vertexSpacingM" | "cutRows"
 >;
 
 /** Combines the parts to a mesh. Throws if a triangle refers to a vertex that does not exist. */
@@ -59,6 +61,7 @@ export function meshOf(parts: Part[]): MeshData {
     triangles,
     fileVertex: named.length === count ? named : Uint32Array.from({ length: count }, (_, i) => i),
     edgeM: first.vertexSpacingM,
+    cutRows: first.cutRows,
   };
 }
 

@@ -19,7 +19,8 @@ export interface Order {
   token: string;
   sessionId: string;
   refinement: number;
-  vertices: [number, number];
+  /** Rows, vertices of a row, and how many of the rows are for the surface within cuts. */
+  vertices: [number, number, number];
 }
 
 /** The newest frame, and the changes since the last message. */
@@ -72,7 +73,8 @@ class Intake {
 
   private async read(signal: AbortSignal, alive: () => void): Promise<void> {
     const { sessionId, refinement } = this.order;
-    const request = { sessionId, refinement, encoding: Encoding.I16, maxFramesInFlight: IN_FLIGHT };
+    const cutSurface = this.field.cutRows > 0;
+    const request = { sessionId, refinement, encoding: Encoding.I16, maxFramesInFlight: IN_FLIGHT, cutSurface };
     const credit = new Credit(this.server, signal);
     this.skipped.before = this.skipped.now;
     let parts: WatchFramesResponse[] = [];

@@ -1,7 +1,7 @@
 // The wound that blades have made in a surface, as `GetWound` returns it: vertices and triangles in place of those that the cut
 // crosses. Each new vertex moves as its host does, so that frames need no more than they have.
 
-import type { CutTriangles, GetWoundResponse, LipVertex } from "./gen/palpate/v1/view_pb.js";
+import type { CutFace, CutTriangles, CutVertex, GetWoundResponse, LipVertex } from "./gen/palpate/v1/view_pb.js";
 import { CALL_TIMEOUT_MS, type Server } from "./server.js";
 
 /** A new vertex: at rest at h + secondPart·(s − h) + thirdPart·(t − h), of its host h and two other vertices. */
@@ -14,6 +14,8 @@ export type Cut = Pick<CutTriangles, "first" | "count" | "corners">;
 type Part = Pick<GetWoundResponse, "version" | "continues" | "firstVertex" | "severed" | "pieces" | "staysWhole"> & {
   vertices: readonly Lip[];
   triangles: readonly Cut[];
+  cutVertices: readonly Pick<CutVertex, "number" | "restXM" | "restYM" | "restZM">[];
+  cutFaces: readonly Pick<CutFace, "number" | "corners">[];
 };
 
 /** What an answer has changed. */
@@ -22,6 +24,8 @@ export interface WoundChange {
   isNew: boolean;
   /** Changed triangles; some may replace earlier ones with the same `first`. */
   cuts: Cut[];
+  /** Whether the surface within cuts has changed. */
+  isWithin: boolean;
 }
 
 /** Maximum number of values of a wound: more than any mesh has that a browser shows. */
@@ -40,10 +44,18 @@ export class Wound {
   /** Changed triangles, by the first. */
   readonly cuts = new Map<number, Cut>();
 
-  /** Of a mesh with so many vertices and triangles. */
+  /**
+   * The surface within the cuts of a solid: x, y, z of each vertex at rest, m, of which the displacement is in the `cutRows` of a field;
+   * and faces of four vertices by their numbers, counterclockwise seen from within the cut.
+   */
+  readonly cutRestM: number[] = [];
+  readonly cutFaces = new Map<number, readonly number[]>();
+
+  /** Of a mesh with so many vertices and triangles, and a field with room for so many vertices of the surface within cuts. */
   constructor(
     readonly vertexCount: number,
     readonly triangleCount: number,
+    readonly mostCutVertices = 0,
   ) {}
 
   /** Takes all parts of an answer that asked for what is new since `version`. Throws if they don't fit, and changes nothing then. */
@@ -64,14 +76,33 @@ export class Wound {
     // Otherwise hiding them would have no end.
     const hidden = cuts.reduce((sum, { count }) => sum + count, 0);
     if (!vertices.every(isLip) || !cuts.every(isCut) || hidden > this.triangleCount) throw new RangeError("the server's wound is not whole");
+    const within = parts.flatMap((part) => part.cutVertices);
+    const faces = parts.flatMap((part) => part.cutFaces);
+    this.checkWithin(within, faces, isNew);
     if (isNew) {
-      this.vertices.length = 0;
+      this.vertices.length = this.cutRestM.length = 0;
       this.cuts.clear();
+      this.cutFaces.clear();
     }
+    for (const { number, restXM, restYM, restZM } of within) [restXM, restYM, restZM].forEach((m, c) => (this.cutRestM[3 * number + c] = m));
+    for (const { number, corners } of faces) this.cutFaces.set(number, corners);
     for (const lip of vertices) this.vertices.push(lip);
     for (const cut of cuts) this.cuts.set(cut.first, cut);
     ({ version: this.version, severed: this.severed, pieces: this.pieces, staysWhole: this.staysWhole } = first);
-    return { isNew, cuts };
+    return { isNew, cuts, isWithin: isNew || within.length > 0 || faces.length > 0 };
+  }
+
+  /** Throws unless these vertices continue those that are known, without gaps, and the faces have vertices. */
+  private checkWithin(vertices: Part["cutVertices"], faces: Part["cutFaces"], isNew: boolean): void {
+    let count = isNew ? 0 : this.cutRestM.length / 3;
+    for (const { number, restXM, restYM, restZM } of vertices) {
+      if (number > count || number >= this.mostCutVertices || ![restXM, restYM, restZM].every(Number.isFinite)) {
+        throw new RangeError("the server's surface within cuts is not whole");
+      }
+      count = Math.max(count, number + 1);
+    }
+    const isFace = ({ corners }: Pick<CutFace, "corners">) => corners.length === 4 && corners.every((corner) => corner < count);
+    if (!faces.every(isFace)) throw new RangeError("the server's surface within cuts has vertices that it lacks");
   }
 
   /** Returns the triangles that are shown in place of those of the mesh. */
@@ -112,9 +143,10 @@ export function mixed({ host, second, third, secondPart, thirdPart }: Lip, value
 export async function followWound(server: Server, sessionId: string, refinement: number, wound: Wound, signal?: AbortSignal): Promise<WoundChange> {
   const parts: GetWoundResponse[] = [];
   let numbers = 0;
-  const request = { sessionId, refinement, sinceVersion: wound.version };
+  const request = { sessionId, refinement, sinceVersion: wound.version, cutSurface: wound.mostCutVertices > 0 };
   for await (const part of server.views.getWound(request, { signal, timeoutMs: CALL_TIMEOUT_MS })) {
     numbers += 1 + part.vertices.length + part.triangles.reduce((sum, { corners }) => sum + 1 + corners.length, 0);
+    numbers += part.cutVertices.length + part.cutFaces.reduce((sum, { corners }) => sum + 1 + corners.length, 0);
     if (numbers > MAX_NUMBERS) throw new RangeError("the server's wound has no end");
     parts.push(part);
     if (part.last) break;

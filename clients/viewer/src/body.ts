@@ -92,7 +92,7 @@ export class Body implements Surface, WoundedSurface {
   ) {
     const { restM, triangles, places, uv } = data;
     const count = (this.count = restM.length / 3);
-    this.field = new Field(...places);
+    this.field = new Field(places[0] + data.cutRows, places[1], data.cutRows);
     this.rest = restM;
     this.triangles = triangles;
     this.position = restM.slice();
@@ -212,7 +212,8 @@ export class Body implements Surface, WoundedSurface {
     const { ny } = this.field;
     const moved = new Uint8Array(this.blocks);
     let most = 0;
-    let any = false;
+    // Of the surface within cuts.
+    let any = this.field.cutRows > 0 && (changed.a1 + 1) * ny > count;
     const end = 3 * Math.min((changed.a1 + 1) * ny, count);
     for (let i = 3 * changed.a0 * ny; i < end; i += 3) {
       const x = Math.fround(rest[i]! + u[i]!);

@@ -255,6 +255,71 @@ export class WoundInside extends ShaderMaterial {
   }
 }
 
+/**
+ * The surface within the cuts of a solid: the tissue's colour, darker and redder, with grains of some tenths of a millimetre to some
+ * millimetres, wet. Its facets are those of the cells.
+ */
+export class CutFace extends ShaderMaterial {
+  constructor() {
+    super({
+      side: DoubleSide,
+      uniforms: { ...light, map: { value: null }, mapped: { value: 0 }, tone: { value: new Color() } },
+      vertexShader: `
+        attribute vec3 rest;
+        varying vec3 vAt;
+        varying vec3 vRest;
+        void main() {
+          vAt = position;
+          vRest = rest;
+          gl_Position = projectionMatrix * viewMatrix * vec4(position, 1.0);
+        }`,
+      fragmentShader: `
+        uniform sampler2D map;
+        uniform float mapped;
+        uniform vec3 tone;
+        varying vec3 vAt;
+        varying vec3 vRest;
+        ${SHADOW}
+        float hash(vec3 at) { return fract(sin(dot(at, vec3(127.1, 311.7, 74.7))) * 43758.5453); }
+        float grain(vec3 at) {
+          vec3 cell = floor(at), part = fract(at);
+          part = part * part * (3.0 - 2.0 * part);
+          vec2 e = vec2(0.0, 1.0);
+          vec4 low = vec4(hash(cell), hash(cell + e.yxx), hash(cell + e.xyx), hash(cell + e.yyx));
+          vec4 high = vec4(hash(cell + e.xxy), hash(cell + e.yxy), hash(cell + e.xyy), hash(cell + e.yyy));
+          vec4 along = mix(low, high, part.z);
+          vec2 across = mix(along.xy, along.zw, part.y);
+          return mix(across.x, across.y, part.x);
+        }
+        void main() {
+          vec3 eye = normalize(cameraPosition - vAt);
+          vec3 n = normalize(cross(dFdx(vAt), dFdy(vAt)));
+          if (dot(n, eye) < 0.0) n = -n;
+          // The mean colour of the image.
+          vec3 colour = mix(tone, texture2D(map, vec2(0.5), 16.0).rgb, mapped) * vec3(0.95, 0.62, 0.58);
+          float grains = 0.5 * grain(vRest * 450.0) + 0.3 * grain(vRest * 1100.0) + 0.2 * grain(vRest * 2600.0);
+          colour *= 0.72 + 0.56 * grains;
+          float share = lit(vAt);
+          float near = contact(vAt);
+          vec3 wrap = vec3(0.28, 0.10, 0.07);
+          vec3 diffuse = max((dot(n, lamp) + wrap) / (1.0 + wrap), 0.0) * mix(vec3(0.26, 0.13, 0.12), vec3(1.0), share);
+          vec3 shown = colour * near * (0.16 + 0.45 * max(dot(n, eye), 0.0) + 0.7 * diffuse);
+          shown = 1.0 - exp(-1.15 * shown);
+          float h = max(dot(n, normalize(lamp + eye)), 0.0);
+          shown += 0.10 * near * share * pow(h, 40.0) * (0.4 + grains);
+          gl_FragColor = vec4(shown, 1.0);
+          #include <colorspace_fragment>
+        }`,
+    });
+  }
+
+  /** Takes on the colour of a skin, also when that changes. */
+  follow(skin: Skin): void {
+    for (const name of ["map", "mapped", "tone"]) this.uniforms[name] = skin.uniforms[name]!;
+    this.uniformsNeedUpdate = true;
+  }
+}
+
 /** The table that the tissue lies on. It fades into the background, and the tissue's shadow lies on it. */
 export class Table extends ShaderMaterial {
   constructor(isBody: boolean) {

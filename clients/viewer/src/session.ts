@@ -162,7 +162,7 @@ export class ShownSession {
       this.refinement = former?.refinement ?? Math.min(refinement ?? chosen, this.mostRefinement);
     }
     this.surface ??= former?.surface ?? this.newSheet();
-    this.wound = new Wound(this.surface.vertexCount, this.surface.triangleCount);
+    this.wound = this.newWound();
     this.hasFormerWound = former !== undefined && (former.hasFormerWound || former.wound.version > 0);
     this.cutVersion = session.topologyVersion;
     this.beforeCuts = session.playback ? [] : (former?.beforeCuts ?? []);
@@ -179,6 +179,11 @@ export class ShownSession {
   /** Returns the number of vertices along a side of a sheet at refinement n: M = (m − 1)·n + m. */
   private vertices(n: number): number {
     return this.points.map((m) => (m - 1) * n + m).reduce((x, y) => x * y);
+  }
+
+  private newWound(): Wound {
+    const { vertexCount, triangleCount, field } = this.surface;
+    return new Wound(vertexCount, triangleCount, field.cutRows * field.ny);
   }
 
   private newSheet(): Surface {
@@ -327,7 +332,7 @@ export class ShownSession {
     if (this.mesh) return this.surface;
     this.refinement = n;
     this.surface = this.newSheet();
-    this.wound = new Wound(this.surface.vertexCount, this.surface.triangleCount);
+    this.wound = this.newWound();
     void this.followCuts();
     if (!this.seen.signal.aborted) this.watch();
     return this.surface;

@@ -31,7 +31,7 @@ import type { ShownGrasper, View } from "./grasper";
 import { GrasperMark, isSamePose } from "./grasper-mark";
 import { Ground } from "./ground";
 import { defaultCameraOfBody, defaultCameraOfSheet } from "./default-camera";
-import { light, Skin, SHADOWS, WoundInside } from "./material";
+import { CutFace, light, Skin, SHADOWS, WoundInside } from "./material";
 import { norm, type Vec3 } from "palpate";
 import type { Lump } from "./lumps";
 import type { Place, Surface } from "./surface";
@@ -93,8 +93,9 @@ export class Stage {
   private markedBalls: Mesh[] = [];
   private readonly inside = new WoundInside(0x5a0d10, 0);
   private readonly lip = new WoundInside(0x2e0608, 5e-4);
-  /** The parts of cut triangles, the tissue between the lips, and the lines along these. */
-  private wound: [Mesh, Mesh, LineSegments] | undefined;
+  private readonly cutFace = new CutFace();
+  /** The parts of cut triangles, the tissue between the lips, the lines along these, and the surface within the cuts of a solid. */
+  private wound: [Mesh, Mesh, LineSegments, Mesh] | undefined;
   private mesh: Mesh | undefined;
   private edge: Mesh | undefined;
   private lines: LineSegments | undefined;
@@ -189,8 +190,9 @@ export class Stage {
     this.mesh = new Mesh(surface.geometry, skin);
     this.edge = surface.edge && new Mesh(surface.edge.geometry, skin);
     this.lines = new LineSegments(surface.lines, this.wires);
-    const { parts, bed, lips } = surface.wound;
-    this.wound = [new Mesh(parts, skin), new Mesh(bed, this.inside), new LineSegments(lips, this.lip)];
+    const { parts, bed, lips, within } = surface.wound;
+    this.wound = [new Mesh(parts, skin), new Mesh(bed, this.inside), new LineSegments(lips, this.lip), new Mesh(within, this.cutFace)];
+    this.cutFace.follow(skin);
     this.ground = new Ground(surface, this.colour.table, this.colour.background);
     for (const part of [this.mesh, this.edge, this.lines, this.ground.mesh, ...this.wound]) {
       if (!part) continue;
@@ -243,7 +245,9 @@ export class Stage {
     if (this.mesh) this.mesh.material = on ? this.hidden : this.skin;
     if (this.wound) {
       this.wound[0].material = on ? this.hidden : this.skin;
-      this.wound[1].visible = !on;
+      // The tissue between the lips stands for what is within; a solid shows that.
+      this.wound[1].visible = !on && !(this.surface && this.surface.field.cutRows > 0);
+      this.wound[3].visible = !on;
     }
     if (this.lines) this.lines.visible = on;
     if (this.edge) this.edge.visible = !on;

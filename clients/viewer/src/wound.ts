@@ -4,7 +4,7 @@
 // A picture takes in at most `CUTS_PER_PICTURE` cut triangles, and the rest of a large wound comes with the next ones.
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage } from "three";
-import { type Cut, mixed, type Wound, type WoundChange } from "palpate";
+import { type Cut, type Field, mixed, type Wound, type WoundChange } from "palpate";
 
 /** Cut triangles, or cells of a refined sheet, that one picture takes in at most. */
 export const CUTS_PER_PICTURE = 512;
@@ -29,6 +29,8 @@ export interface WoundedSurface {
   drawnVertex(vertex: number): number;
   /** Returns coordinate `c` of a vertex at rest, m. */
   restOf(vertex: number, c: number): number;
+  /** Where the surface within cuts is: its displacements are in the last rows of the field. */
+  readonly field: Field;
   /** Hides triangles of the mesh, or shows all again. */
   hide(first: number, count: number): void;
   showAll(): void;
@@ -42,6 +44,9 @@ export class ShownWound {
   readonly parts = new BufferGeometry();
   readonly bed = new BufferGeometry();
   readonly lips = new BufferGeometry();
+  /** The surface within the cuts of a solid. */
+  readonly within = new BufferGeometry();
+  private isWithinStale = false;
   /** The most cut triangles that one picture took in; for tests. */
   mostAtOnce = 0;
   private wound: Wound | undefined;
@@ -59,15 +64,17 @@ export class ShownWound {
 
   constructor(private readonly surface: WoundedSurface) {}
 
-  /** Number of shown cuts, and of those that wait for the next pictures. */
-  get count(): { shown: number; waiting: number } {
-    return { shown: this.placesOf.size, waiting: this.waiting.length };
+  /** Number of shown cuts, of those that wait for the next pictures, and of drawn faces within the cuts of a solid. */
+  get count(): { shown: number; waiting: number; within: number } {
+    const within = (this.within.index?.count ?? 0) / 6;
+    return { shown: this.placesOf.size, waiting: this.waiting.length, within };
   }
 
   /** Shows what has changed of a wound. */
-  take(wound: Wound, { isNew, cuts }: WoundChange): void {
+  take(wound: Wound, { isNew, cuts, isWithin }: WoundChange): void {
     if (isNew) this.clear();
     this.wound = wound;
+    this.isWithinStale ||= isWithin;
     // Of several with the same first triangle, the last one counts.
     this.waiting = [...new Map([...this.waiting, ...cuts].map((cut) => [cut.first, cut])).values()];
   }
@@ -77,7 +84,7 @@ export class ShownWound {
     [this.waiting, this.places, this.vertexOf.length, this.free.length] = [[], 0, 0, 0];
     this.slotOf.clear();
     this.placesOf.clear();
-    for (const geometry of [this.parts, this.bed, this.lips]) geometry.setDrawRange(0, 0);
+    for (const geometry of [this.parts, this.bed, this.lips, this.within]) geometry.setDrawRange(0, 0);
   }
 
   /** The surface has other drawn vertices. */
@@ -94,6 +101,8 @@ export class ShownWound {
     for (const cut of now) this.show(cut);
     if (now.length > 0) this.parts.index!.needsUpdate = this.lips.index!.needsUpdate = true;
     if (this.vertexOf.length > 0 && (hasMoved || now.length > 0 || this.isStale)) this.follow();
+    if (this.isWithinStale) this.buildWithin();
+    else if (hasMoved) this.followWithin();
     return this.waiting.length > 0;
   }
 
@@ -215,7 +224,36 @@ export class ShownWound {
     this.isStale = false;
   }
 
+  /** Makes the surface within the cuts anew: it has few faces. */
+  private buildWithin(): void {
+    this.isWithinStale = false;
+    const { cutRestM, cutFaces } = this.wound ?? { cutRestM: [], cutFaces: new Map<number, readonly number[]>() };
+    const index = new Uint32Array(6 * cutFaces.size);
+    let at = 0;
+    for (const [a, b, c, d] of cutFaces.values()) {
+      index.set([a!, b!, c!, a!, c!, d!], at);
+      at += 6;
+    }
+    this.within.dispose();
+    this.within.setIndex(new BufferAttribute(index, 1));
+    this.within.setAttribute("rest", new BufferAttribute(Float32Array.from(cutRestM), 3));
+    this.within.setAttribute("position", new BufferAttribute(Float32Array.from(cutRestM), 3).setUsage(DynamicDrawUsage));
+    this.within.setDrawRange(0, at);
+    this.followWithin();
+  }
+
+  /** Puts the surface within the cuts where the newest frame has it. */
+  private followWithin(): void {
+    const rest = this.wound?.cutRestM ?? [];
+    const position = this.within.getAttribute("position") as BufferAttribute | undefined;
+    if (rest.length === 0 || !position || position.array.length !== rest.length) return;
+    const { displacementM, nx, ny, cutRows } = this.surface.field;
+    const first = 3 * (nx - cutRows) * ny;
+    for (let k = 0; k < rest.length; k++) position.array[k] = rest[k]! + displacementM[first + k]!;
+    position.needsUpdate = true;
+  }
+
   dispose(): void {
-    for (const geometry of [this.parts, this.bed, this.lips]) geometry.dispose();
+    for (const geometry of [this.parts, this.bed, this.lips, this.within]) geometry.dispose();
   }
 }

@@ -28,6 +28,7 @@ mod tools;
 pub use body::footprint::{Footprint, RestSurface, WeightedNode};
 pub use body::model::{self, Model, Plan};
 pub use body::severed::{Cuts, SeveredJoint};
+pub use body::solid::cut_surface::{CutFace, CutSurface, CutVertex};
 pub use compile::check_processor;
 pub use interface::{BlowUp, CheckFailure, Energy, Hashing, PointState, ReadCopy, Released, Tissue};
 pub use scheme::order;

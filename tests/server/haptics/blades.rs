@@ -46,15 +46,20 @@ pub(crate) async fn topology(server: &TestServer, session_id: &str, since_versio
 }
 
 async fn wound(server: &TestServer, session_id: &str, refinement: u32, since_version: u32) -> pb::GetWoundResponse {
-    let request = pb::GetWoundRequest { session_id: session_id.to_owned(), refinement, since_version };
+    let cut_surface = true;
+    let request = pb::GetWoundRequest { session_id: session_id.to_owned(), refinement, since_version, cut_surface };
     let mut parts = server.views().await.get_wound(request).await.unwrap().into_inner();
     let mut whole = pb::GetWoundResponse::default();
     while let Some(part) = parts.message().await.unwrap() {
         assert!(!whole.last);
         let (mut vertices, mut triangles) = (std::mem::take(&mut whole.vertices), std::mem::take(&mut whole.triangles));
+        let (mut cut_vertices, mut cut_faces) =
+            (std::mem::take(&mut whole.cut_vertices), std::mem::take(&mut whole.cut_faces));
         vertices.extend(part.vertices.iter().copied());
         triangles.extend(part.triangles.iter().cloned());
-        whole = pb::GetWoundResponse { vertices, triangles, ..part };
+        cut_vertices.extend(part.cut_vertices.iter().copied());
+        cut_faces.extend(part.cut_faces.iter().cloned());
+        whole = pb::GetWoundResponse { vertices, triangles, cut_vertices, cut_faces, ..part };
     }
     assert!(whole.last);
     whole
@@ -148,8 +153,75 @@ async fn a_wound_is_sent_to_a_viewer_that_follows_and_whole_to_a_late_one() {
     let version = wound(&server, &session, 0, 0).await.version;
     while frames.message().await.unwrap().unwrap().topology_version < version {}
     let mut views = server.views().await;
-    let refused = views.get_wound(pb::GetWoundRequest { session_id: session, refinement: 99, since_version: 0 });
+    let refused = views.get_wound(pb::GetWoundRequest { session_id: session, refinement: 99, ..Default::default() });
     assert!(refused.await.is_err());
+}
+
+#[tokio::test]
+async fn a_viewer_that_asks_for_it_sees_into_the_cut_of_a_solid() {
+    let server = TestServer::start(&[]);
+    // A block of 100 × 100 × 40 mm.
+    let session = create(&server, pb::create_session_request::Source::SceneName("phantom".into())).await;
+    let with_knife =
+        |session: &str| pb::TouchOpen { instruments: vec![instrument::instrument(&knife(), 0)], ..open(session, &[0]) };
+    let mut touch = TestTouch::open(&server, with_knife(&session)).await.unwrap();
+    let mut mesh =
+        server.views().await.get_mesh(pb::GetMeshRequest { session_id: session.clone(), refinement: 0 }).await;
+    let mesh = mesh.as_mut().unwrap().get_mut().message().await.unwrap().unwrap();
+    assert!(mesh.cut_rows > 0);
+    assert!(wound(&server, &session, 0, 0).await.cut_faces.is_empty());
+    for step in 0..STEPS {
+        let y = -0.055 + 0.07 * step as f64 / STEPS as f64;
+        let pose = InstrumentPose {
+            place_m: DVec3::new(0.003, y, 0.024),
+            orientation: DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2),
+            jaw_rad: 0.0,
+        };
+        let action = Some(Action::Instrument(instrument::pose(&pose)));
+        touch
+            .command(pb::Command {
+                tool: 0,
+                sequence: Some(step + 1),
+                at_step: Some(step),
+                action,
+                ..Default::default()
+            })
+            .await;
+    }
+    touch.settle().await;
+    server.start_until(&session, STEPS).await;
+    touch.sample_with(|sample| sample.step == STEPS).await;
+    let all = wound(&server, &session, 0, 0).await;
+    assert!(all.cut_faces.len() > 20 && all.cut_faces.len() <= 2 * all.severed as usize, "{}", all.cut_faces.len());
+    let count = all.cut_vertices.len() as u32;
+    assert!(all.cut_vertices.iter().zip(0..).all(|(vertex, number)| vertex.number == number));
+    assert!(
+        all.cut_faces.iter().all(|face| face.corners.len() == 4 && face.corners.iter().all(|corner| *corner < count))
+    );
+    assert!(count <= mesh.cut_rows * mesh.vertices_y);
+    let bytes = prost::Message::encoded_len(&all);
+    println!("{bytes} bytes for {} faces", all.severed);
+    // Frames have their displacements, if a viewer asks for them.
+    for cut_surface in [false, true] {
+        let request = pb::WatchFramesRequest { session_id: session.clone(), cut_surface, ..Default::default() };
+        let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+        let part = frames.message().await.unwrap().unwrap();
+        let rows = if cut_surface { mesh.cut_rows } else { 0 };
+        assert_eq!((part.vertices_x, part.vertices_y), (mesh.vertices_x + rows, mesh.vertices_y));
+        let first = mesh.vertices_x * mesh.vertices_y;
+        let sent = |at: u32| {
+            let (x, y) = (at / part.vertices_y, at % part.vertices_y);
+            part.patches.iter().any(|patch| {
+                (patch.first_x..patch.first_x + patch.count_x).contains(&x)
+                    && (patch.first_y..patch.first_y + patch.count_y).contains(&y)
+            })
+        };
+        assert!((first..first + count).all(|at| sent(at) == cut_surface), "{cut_surface}");
+    }
+    let plain = pb::GetWoundRequest { session_id: session, ..Default::default() };
+    let mut parts = server.views().await.get_wound(plain).await.unwrap().into_inner();
+    let part = parts.message().await.unwrap().unwrap();
+    assert!(part.cut_vertices.is_empty() && part.cut_faces.is_empty() && !part.vertices.is_empty());
 }
 
 #[tokio::test]

@@ -59,10 +59,12 @@ impl Snapshot {
 
     /// Returns this snapshot with the skin of a tissue on a mesh, which must be that of its model. If other vertices
     /// are shown than are simulated, the encoder computes their displacements; otherwise, and with `None`, the skin
-    /// is ignored.
+    /// is ignored. With that of a solid, rows for the vertices of the surface within cuts follow those of the surface.
     #[must_use]
     pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
-        Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
+        let [rows, columns] = self.points;
+        let points = [rows + skin.map_or(0, |skin| skin.cut_rows()), columns];
+        Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), points, ..self }
     }
 
     /// Returns this snapshot with what was severed at its moment.

@@ -3,6 +3,8 @@
 //!
 //! Frames carry no normals; viewers compute them: `clients/library/src/surface_view.rs` and `src/render/surface.rs`.
 
+#[cfg(test)]
+mod cut_surface_tests;
 mod displacements;
 pub mod encode;
 pub mod refine;

@@ -82,6 +82,12 @@ impl Refinement {
         Ok(refinement)
     }
 
+    /// Returns this refinement with so many more rows.
+    pub(super) fn with_rows(self, more: usize) -> Self {
+        let [rows, columns] = self.points;
+        Refinement { points: [rows + more, columns], ..self }
+    }
+
     /// Returns nx and ny, the numbers of vertices along x and y; of a mesh, rows and places per row.
     pub fn vertices(&self) -> [usize; 2] {
         self.points.map(|points| (points - 1) * (self.between + 1) + 1)

@@ -1,14 +1,17 @@
 //! The vertices of a tissue's surface as frames show them, in an order that keeps neighbours together. If the simulated
 //! points are not these vertices, as on a mesh coarser than its file, each vertex moves with a place among them.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use glam::DVec3;
 use palpate_geometry::Group;
 
+use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::shape::{BoundPlace, CellPlace, PointId, RestShape, ShownShape};
-use palpate_tissue::{Cuts, Model};
+use palpate_tissue::{CutSurface, Cuts, Model};
+
+use super::refine::{MESH_ROW, Refinement};
 
 /// Name of the skin's tables in messages.
 const TABLES: &str = "the shown surface of a mesh";
@@ -29,6 +32,9 @@ pub struct Skin {
     in_cells: Vec<CellPlace>,
     /// Rest positions of the points then, in the order of memory, m.
     rest_m: Vec<DVec3>,
+    model: Arc<Model>,
+    /// The newest surface within cuts, and what was severed then.
+    cut_surface: Mutex<(Cuts, Arc<CutSurface>)>,
 }
 
 /// A vertex that moves with a triangle of points.
@@ -43,13 +49,13 @@ struct SkinVertex {
 impl Skin {
     /// Creates the skin of a tissue; `None` if its points are a grid, which needs none. It unwinds with a refusal if there
     /// is no memory for its tables (`palpate_tissue::memory`).
-    pub fn of(model: &Model) -> Option<Arc<Self>> {
+    pub fn of(model: &Arc<Model>) -> Option<Arc<Self>> {
         let [order, place_of] = model.shown_order()?;
         let shape = model.scene.shared_shape();
         let shown = shape.shown_surface()?;
         let uv = shape.shown_uv();
         if !shown.in_cells.is_empty() {
-            return Some(Arc::new(Self::in_cells(shown.in_cells, place_of, uv, shape.clone())));
+            return Some(Arc::new(Self::in_cells(shown.in_cells, place_of, uv, model)));
         }
         if shown.bound.is_empty() {
             let (vertices, places) = (order.to_vec(), place_of.to_vec());
@@ -61,6 +67,8 @@ impl Skin {
                 in_cells: Vec::new(),
                 rest_m: Vec::new(),
                 shape,
+                model: model.clone(),
+                cut_surface: Mutex::default(),
             }));
         }
         let triangles = shape.triangles();
@@ -81,11 +89,12 @@ impl Skin {
         let bound = memory::collected(bound, TABLES);
         let rest_m = order.iter().map(|point| shape.rest_m(PointId::new(*point as usize)));
         let rest_m = memory::collected(rest_m, TABLES);
-        Some(Arc::new(Skin { vertices, places, uv, bound, in_cells: Vec::new(), rest_m, shape }))
+        let (in_cells, model, cut_surface) = (Vec::new(), model.clone(), Mutex::default());
+        Some(Arc::new(Skin { vertices, places, uv, bound, in_cells, rest_m, shape, model, cut_surface }))
     }
 
     /// Creates the skin of a tissue whose surface moves with cells of points.
-    fn in_cells(cells: &[CellPlace], place_of: &[u32], uv: Option<Vec<[f32; 2]>>, shape: Arc<dyn RestShape>) -> Self {
+    fn in_cells(cells: &[CellPlace], place_of: &[u32], uv: Option<Vec<[f32; 2]>>, model: &Arc<Model>) -> Self {
         // Vertices that move with neighbouring cells are shown side by side.
         #[allow(clippy::cast_possible_truncation)]
         let mut vertices: Vec<u32> = memory::collected(0..cells.len() as u32, TABLES);
@@ -99,7 +108,8 @@ impl Skin {
             CellPlace { points: points.map(|point| place_of[point as usize]), weights }
         };
         let in_cells = memory::collected(vertices.iter().map(in_memory), TABLES);
-        Skin { vertices, places, uv, bound: Vec::new(), in_cells, rest_m: Vec::new(), shape }
+        let (shape, model, cut_surface) = (model.scene.shared_shape(), model.clone(), Mutex::default());
+        Skin { vertices, places, uv, bound: Vec::new(), in_cells, rest_m: Vec::new(), shape, model, cut_surface }
     }
 
     /// Returns the shown surface at rest.
@@ -157,6 +167,34 @@ impl Skin {
         !self.bound.is_empty() || !self.in_cells.is_empty()
     }
 
+    /// Returns the surface within the cuts of a solid; empty for other tissues. The newest one is kept.
+    pub fn cut_surface(&self, cuts: &Cuts) -> Arc<CutSurface> {
+        if self.in_cells.is_empty() || cuts.is_empty() {
+            return Arc::default();
+        }
+        let mut kept = lock(&self.cut_surface);
+        if !kept.0.is_same(cuts) {
+            *kept = (cuts.clone(), Arc::new(CutSurface::of(&self.model, cuts)));
+        }
+        kept.1.clone()
+    }
+
+    /// Returns the place in a frame of the first vertex of the surface within cuts: that of the row after the last vertex.
+    pub fn first_cut_place(&self) -> usize {
+        self.vertices.len().next_multiple_of(MESH_ROW)
+    }
+
+    /// Returns a refinement of frames that have the vertices of the surface within cuts as well, if this is a solid.
+    #[must_use]
+    pub fn with_cut_surface(&self, refinement: Refinement) -> Refinement {
+        refinement.with_rows(self.cut_rows())
+    }
+
+    /// Returns the number of rows of a frame for the vertices of the surface within cuts: 0 but for a solid.
+    pub fn cut_rows(&self) -> usize {
+        if self.in_cells.is_empty() { 0 } else { self.model.most_cut_vertices().div_ceil(MESH_ROW) }
+    }
+
     /// Returns the place in memory of the least corner of the cell that the vertex at each place of a frame moves with; empty but for a
     /// solid.
     pub(super) fn cells(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
@@ -165,6 +203,7 @@ impl Skin {
 
     /// Returns the displacements of the shown vertices, m, in the order of a frame of `count` places, from those of
     /// the simulated vertices in the order of memory. Vertices in cells that a cut has parted from others move with their own cell.
+    /// Those of the surface within cuts follow, as many as there is room for.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], cuts: &Cuts, count: usize) -> [Vec<f32>; 3] {
         let mut shown_m = [(); 3].map(|()| memory::zeroed::<f32>(count, TABLES));
@@ -173,6 +212,13 @@ impl Skin {
             for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
                 let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
                 shown_m[place] = points.iter().zip(weights).map(part_m).sum::<f64>() as f32;
+            }
+        }
+        let cut_places = self.first_cut_place()..count;
+        for (place, vertex) in cut_places.zip(&self.cut_surface(cuts).vertices) {
+            for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
+                let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
+                shown_m[place] = vertex.corners.iter().zip(&vertex.weights).map(part_m).sum::<f64>() as f32;
             }
         }
         for (place, bound) in self.bound.iter().enumerate() {
@@ -194,7 +240,7 @@ impl Skin {
 
 impl PartialEq for Skin {
     fn eq(&self, other: &Self) -> bool {
-        // `places` and `rest_m` follow from these.
+        // The rest follows from these.
         std::ptr::eq(self, other)
             || self.surface() == other.surface()
                 && self.vertices == other.vertices

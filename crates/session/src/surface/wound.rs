@@ -415,4 +415,4 @@ fn parts_of(crossed: &Crossed, lip: impl Fn(usize, u32) -> u32, middle: u32) -> 
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

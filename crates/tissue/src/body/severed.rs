@@ -69,6 +69,11 @@ impl Cuts {
         (self.grows_since..=self.version).contains(&since)
     }
 
+    /// Returns whether this is a clone of the same cuts. Cheap; other cuts with equal springs are not the same.
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.version == other.version && Arc::ptr_eq(&self.springs, &other.springs)
+    }
+
     /// Returns the number of severed springs.
     pub fn len(&self) -> usize {
         self.springs.len()

@@ -4,6 +4,7 @@ use glam::DVec3;
 
 use crate::body::model::Model;
 use crate::kernel::field::{Layout, State};
+use crate::kernel::lanes::{self, SingleWork};
 use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, TILE, sides_of};
 
@@ -41,36 +42,77 @@ impl SpringSearch {
         self.longest_m
     }
 
-    /// Returns whether the box around the points of a tile touches that between two corners, m; `moved` are the tiles whose points may not
-    /// be at rest. A box counts from that at rest, and grows by displacements.
-    pub(crate) fn touches<T: Real>(
+    /// Returns the tiles whose boxes touch that between two corners, m, ascending; `moved` are the tiles whose points may not be at rest. A
+    /// box counts from that at rest, and grows by displacements.
+    pub(crate) fn near<T: Real>(
         &self,
         model: &Model,
         layout: &Layout,
         state: &State<T>,
         moved: &Marks,
-        tile: usize,
-        [least_m, most_m]: [DVec3; 2],
-    ) -> bool {
-        let [low_m, high_m] = self.boxes[tile];
-        let (below, above) = (high_m.cmplt(least_m), low_m.cmpgt(most_m));
-        if !moved.has[tile] {
-            return !(below | above).any();
-        }
-        // Along the other axes the boxes touch already at rest.
-        (0..3).filter(|c| (below | above).test(*c)).all(|c| {
-            let sign = if below.test(c) { T::of(1.0) } else { T::of(-1.0) };
-            let most = largest(layout, &state.u[c * layout.plane..], tile, sign).wide();
-            if below.test(c) {
-                high_m[c] + model.unit_m * most >= least_m[c]
-            } else {
-                low_m[c] - model.unit_m * most <= most_m[c]
+        within_m: [DVec3; 2],
+    ) -> Vec<NearTile> {
+        lanes::single(&Near { search: self, unit_m: model.unit_m, layout, u: &state.u, moved, within_m })
+    }
+}
+
+/// A tile near a box.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct NearTile {
+    pub(crate) tile: usize,
+    /// The least and the greatest displacement of its points along each axis, in units of the model, both with 0.
+    pub(crate) displaced: [DVec3; 2],
+}
+
+/// The search for the tiles near a box.
+struct Near<'a, T> {
+    search: &'a SpringSearch,
+    unit_m: f64,
+    layout: &'a Layout,
+    u: &'a [T],
+    moved: &'a Marks,
+    within_m: [DVec3; 2],
+}
+
+impl<T: Real> SingleWork for Near<'_, T> {
+    type Output = Vec<NearTile>;
+
+    #[inline(always)]
+    fn compute(&self) -> Vec<NearTile> {
+        let Near { search, unit_m, layout, u, moved, within_m: [least_m, most_m] } = self;
+        let mut near = Vec::new();
+        for (tile, [low_m, high_m]) in search.boxes.iter().enumerate() {
+            let (below, above) = (high_m.cmplt(*least_m), low_m.cmpgt(*most_m));
+            let mut displaced = [DVec3::ZERO; 2];
+            if !moved.has[tile] {
+                if !(below | above).any() {
+                    near.push(NearTile { tile, displaced });
+                }
+                continue;
             }
-        })
+            // First along the axes along which the boxes are apart at rest: most tiles are far.
+            let mut touches = true;
+            for apart in [true, false] {
+                for c in 0..3 {
+                    if !touches || (below | above).test(c) != apart {
+                        continue;
+                    }
+                    let most = |sign: T| largest(layout, &u[c * layout.plane..], tile, sign).wide();
+                    (displaced[0][c], displaced[1][c]) = (-most(T::of(-1.0)), most(T::of(1.0)));
+                    touches = high_m[c] + unit_m * displaced[1][c] >= least_m[c]
+                        && low_m[c] + unit_m * displaced[0][c] <= most_m[c];
+                }
+            }
+            if touches {
+                near.push(NearTile { tile, displaced });
+            }
+        }
+        near
     }
 }
 
 /// Returns the largest value in a tile of a plane, times 1 or −1; at least 0.
+#[inline(always)]
 fn largest<T: Real>(layout: &Layout, plane: &[T], tile: usize, sign: T) -> T {
     let [rows, columns] = sides_of(layout, tile);
     // A lane for each column: only then does the compiler compare a row at once.

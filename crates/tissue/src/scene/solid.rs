@@ -34,6 +34,7 @@ pub use fixed::FixedPart;
 use foundation::Foundation;
 pub use gravity::Gravity;
 pub use layer::Layer;
+pub(crate) use shape::CORNERS;
 use shape::places_in_cube;
 pub use shape::{CellSize, SolidShape};
 use slowest::SlowestVibration;

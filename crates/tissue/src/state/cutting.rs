@@ -22,7 +22,7 @@ use glam::DVec3;
 use crate::body::model::{Model, displacement_m};
 use crate::body::severed::SeveredSpring;
 use crate::body::spring_ends::SpringEnd;
-use crate::body::spring_search::SpringSearch;
+use crate::body::spring_search::{NearTile, SpringSearch};
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
 use crate::stage_times::StepStage;
@@ -186,10 +186,9 @@ impl<T: Real> TissueState<T> {
             };
             (model.unit_m * vector(&state.u), ways * vector(&state.d))
         };
-        for tile in 0..tiles.tile_count() {
-            if !search.touches(model, layout, state, &tiles.moved, tile, [least_m - reach_m, most_m + reach_m]) {
-                continue;
-            }
+        for NearTile { tile, .. } in
+            search.near(model, layout, state, &tiles.moved, [least_m - reach_m, most_m + reach_m])
+        {
             let [rows, columns] = sides_of(layout, tile);
             // Plain loops: iterators over both are not inlined.
             for i in rows {

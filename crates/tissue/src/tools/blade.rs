@@ -44,6 +44,12 @@ impl Tool {
         let place_m = self.place_m(fraction);
         let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
         let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
+        if model.scene.cutting.resistance_n(length_m) <= 0.0 {
+            // Nothing is felt, wherever the edge pierces the surface.
+            self.contact_state = ContactState::Free;
+            self.resistance_n = 0.0;
+            return ContactForce::default();
+        }
         if self.contact_state == ContactState::Free && plan.is_first(fraction) {
             self.seek_pierced(model, layout, state, [place_m, edge_m]);
         }

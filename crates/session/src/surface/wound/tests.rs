@@ -125,7 +125,7 @@ fn assert_parted(mesh: &Mesh, wound: &Wound, edges: &[SeveredEdge]) {
 }
 
 /// Leads an upright blade through a tissue. Returns its cuts at each version of the topology.
-fn cut(tissue: &mut dyn Tissue, from_m: DVec3, to_m: DVec3, steps: u32) -> Vec<Cuts> {
+pub(in super::super) fn cut(tissue: &mut dyn Tissue, from_m: DVec3, to_m: DVec3, steps: u32) -> Vec<Cuts> {
     let tip = Tip { shape: TipShape::Blade, radius_m: 0.001, edge_m: 0.02 * DVec3::Z, ..Tip::default() };
     let mut cuts = vec![tissue.cuts()];
     for step in 0..=steps {
@@ -242,7 +242,7 @@ fn a_slit_in_a_mesh_has_two_lips_and_nothing_reaches_across_it() {
 }
 
 /// A block of 100 × 100 × 40 mm on a table.
-fn block() -> Arc<Model> {
+pub(in super::super) fn block() -> Arc<Model> {
     let text = "[solid]\norgan = { name = \"phantom\", edge_m = 0.006, seed = 1 }\ncell_m = 0.008\n\
                 fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
                 [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\n[stepping]\nsubsteps = 4\n";

@@ -138,6 +138,12 @@ impl CornerCopies {
         copy.and_then(|copy| self.copies.get(copy)).map_or(place, |copy| copy.corner as usize)
     }
 
+    /// Returns the version of the topology since which a place is a copy of a corner; `None` if it is none.
+    pub(crate) fn since(&self, place: usize) -> Option<u32> {
+        let copy = place.checked_sub(self.first_spare as usize)?;
+        self.copies.get(copy).map(|copy| copy.version)
+    }
+
     /// Returns the version of the topology since which two cubes, given by their least corners, no longer share a corner that they have in
     /// common; `None` if they share all.
     pub(crate) fn apart_since(&self, places: &SolidPlaces, cubes: [usize; 2]) -> Option<u32> {

@@ -9,6 +9,7 @@
 
 pub(crate) mod corner_copies;
 pub(crate) mod cut_cubes;
+pub(crate) mod cut_surface;
 pub(crate) mod footprint;
 pub(crate) mod inversion;
 pub(crate) mod linear_cells;

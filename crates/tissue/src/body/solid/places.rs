@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_geometry::surface::Surface;
 
 use crate::body::tile_links::TileLinks;
 use crate::kernel::field::{BLOCK, Field, Layout};
@@ -165,6 +166,27 @@ impl SolidPlaces {
     /// Returns the point at each place (the number of none where there is none), and the place of each point.
     pub(crate) fn order(&self) -> [&[u32]; 2] {
         self.shape.order()
+    }
+
+    /// Returns the coordinates of a corner in the lattice.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn coordinates(&self, place: usize) -> DVec3 {
+        DVec3::from_array(self.shape.corner_at(place).map(|at| at as f64))
+    }
+
+    /// Returns the coordinates in the lattice of a place at rest, m.
+    pub(crate) fn coordinates_at(&self, place_m: DVec3) -> DVec3 {
+        self.shape.lattice().from_m(place_m)
+    }
+
+    /// Returns where coordinates in the lattice are at rest, m.
+    pub(crate) fn at_m(&self, coordinates: DVec3) -> DVec3 {
+        self.shape.lattice().origin_m + self.edge_m() * coordinates
+    }
+
+    /// Returns the surface that frames show, at rest.
+    pub(crate) fn shown_surface(&self) -> &Surface {
+        self.shape.surface().surface()
     }
 
     /// Returns the edge of a cube, m.

@@ -13,6 +13,7 @@ use crate::body::severed::SeveredSpring;
 use crate::body::solid::SolidPlaces;
 use crate::body::solid::corner_copies::{CornerCopies, CutCube};
 use crate::body::spring_ends::SpringEnd;
+use crate::body::spring_search::NearTile;
 use crate::body::tables::SweepTables;
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
@@ -27,34 +28,92 @@ const SLACK: f64 = 0.75;
 /// The axes.
 const AXES: usize = 3;
 
+/// A cube near a blade.
+#[derive(Debug, Clone, Copy)]
+struct NearCube {
+    cube: usize,
+    /// Its middle at the end of the step, and the displacement and the way in the step of its middle, m.
+    middle_m: DVec3,
+    u_m: DVec3,
+    way_m: DVec3,
+}
+
 impl<T: Real> TissueState<T> {
-    /// Returns the faces that a blade crosses, from the lower one of their cubes; some perhaps twice.
-    #[allow(clippy::cast_precision_loss)]
+    /// Returns the faces that a blade crosses, from the lower one of their cubes.
     pub(super) fn crossed_faces(&self, sweep: &EdgeSweep) -> Vec<Crossing> {
-        let TissueState { model, tables, state, tiles, spring_search, .. } = self;
-        let (Some(search), Some(places)) = (spring_search, model.places.solid()) else { return Vec::new() };
-        let (layout, mut found) = (&tables.layout, Vec::new());
+        let TissueState { model, tables, .. } = self;
+        let (Some(places), mut found) = (model.places.solid(), Vec::new()) else { return Vec::new() };
         let [least_m, most_m] = sweep.bounds_m();
-        let is_near = |place_m: DVec3, edges: f64| {
-            let reach_m = edges * model.unit_m;
-            place_m.cmpge(least_m - reach_m).all() && place_m.cmple(most_m + reach_m).all()
-        };
-        // By the displacement of the least corner alone: a cube's middle follows.
-        let reach_m = (REACH + SLACK) * model.unit_m;
-        for tile in 0..tiles.tile_count() {
-            if !search.touches(model, layout, state, &tiles.moved, tile, [least_m - reach_m, most_m + reach_m]) {
+        let near = self.cubes_near(places, [least_m, most_m]);
+        let reach_m = REACH * model.unit_m;
+        for (index, own) in near.iter().enumerate() {
+            let NearCube { cube, middle_m, u_m, way_m } = *own;
+            if !is_within([least_m, most_m], reach_m, middle_m) {
                 continue;
             }
+            for axis in 0..AXES {
+                let number = 2 * axis;
+                let Some(other) = places.cube_across(cube, axis, true) else { continue };
+                if tables.severed.has(model.first_end(cube) + number) {
+                    continue;
+                }
+                // The next one along x follows; most others are in the list as well.
+                let after = &near[index + 1..];
+                let beyond = match after.binary_search_by_key(&other, |near| near.cube) {
+                    Ok(at) => after[at],
+                    Err(_) => self.near_cube(places, other),
+                };
+                let span_m = model.unit_m * DVec3::AXES[axis] + (beyond.u_m - u_m);
+                let moved_m = 0.5 * (way_m + beyond.way_m);
+                let (low_m, high_m) = (span_m.min(DVec3::ZERO), span_m.max(DVec3::ZERO));
+                let slack_m = moved_m.abs();
+                if (middle_m + high_m + slack_m).cmplt(least_m).any()
+                    || (middle_m + low_m - slack_m).cmpgt(most_m).any()
+                {
+                    continue;
+                }
+                if let Some(part) = sweep.crosses(middle_m, span_m, moved_m) {
+                    let rest = DVec3::AXES[axis];
+                    let spring = SpringEnd { number, other, rest, stiffness_n_per_m: 0.0, tension_n_per_m: 0.0 };
+                    found.push(Crossing { place: cube, spring, part });
+                }
+            }
+        }
+        found
+    }
+
+    /// Returns the cubes whose least corners are near a box, ascending.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn cubes_near(&self, places: &SolidPlaces, within_m: [DVec3; 2]) -> Vec<NearCube> {
+        let TissueState { model, tables, state, tiles, spring_search, .. } = self;
+        let (Some(search), mut near) = (spring_search, Vec::new()) else { return Vec::new() };
+        let layout = &tables.layout;
+        // By the displacement of the least corner alone: a cube's middle follows.
+        let reach_m = (REACH + SLACK) * model.unit_m;
+        let [least_m, most_m] = within_m;
+        let near_tiles = search.near(model, layout, state, &tiles.moved, [least_m - reach_m, most_m + reach_m]);
+        for NearTile { tile, displaced } in near_tiles {
             let [rows, columns] = sides_of(layout, tile);
+            // Where a cube's least corner is at rest if it is near.
+            let from_m = least_m - reach_m - model.unit_m * displaced[1];
+            let to_m = most_m + reach_m - model.unit_m * displaced[0];
             for row in rows {
                 // Without the divisions that find one cube's place.
                 let (first_m, from) = (model.end_at_rest_m(row * layout.columns), row * layout.stride);
-                for column in columns.clone() {
+                if (first_m.cmplt(from_m) | first_m.cmpgt(to_m)).bitmask() & 0b110 != 0 {
+                    continue;
+                }
+                // Saturating casts: the ends may be anywhere.
+                let [begin, end] = [from_m.x, to_m.x].map(|x_m| (x_m - first_m.x) / model.unit_m);
+                let begin = columns.start.max(begin.ceil().max(0.0) as usize);
+                let end = columns.end.min((end.floor() + 1.0).max(0.0) as usize);
+                for column in begin..end {
                     let cube = row * layout.columns + column;
-                    let middle_m =
+                    #[allow(clippy::cast_precision_loss)]
+                    let at_m =
                         first_m + model.unit_m * (column as f64 * DVec3::X + self.vector_at(&state.u, from + column));
-                    if is_near(middle_m, REACH + SLACK) && places.weight(cube) > 0.0 {
-                        self.crossed_faces_of(places, cube, sweep, &is_near, &mut found);
+                    if is_within(within_m, reach_m, at_m) && places.weight(cube) > 0.0 {
+                        near.push(self.near_cube(places, cube));
                     }
                 }
             }
@@ -66,49 +125,19 @@ impl<T: Real> TissueState<T> {
                 continue;
             }
             let Some([at, ..]) = tables.cut_offsets(number) else { continue };
-            if is_near(*middle_m + model.unit_m * self.vector_at(&state.u, at), REACH + SLACK) {
-                self.crossed_faces_of(places, *cube as usize, sweep, &is_near, &mut found);
+            if is_within(within_m, reach_m, *middle_m + model.unit_m * self.vector_at(&state.u, at)) {
+                near.push(self.near_cube(places, *cube as usize));
             }
         }
-        found
+        near.sort_unstable_by_key(|near| near.cube);
+        near.dedup_by_key(|near| near.cube);
+        near
     }
 
-    /// Adds the faces of a cube with the higher coordinate that a blade crosses.
-    fn crossed_faces_of(
-        &self,
-        places: &SolidPlaces,
-        cube: usize,
-        sweep: &EdgeSweep,
-        is_near: &impl Fn(DVec3, f64) -> bool,
-        found: &mut Vec<Crossing>,
-    ) {
-        let TissueState { model, tables, .. } = self;
+    /// Returns where a cube is.
+    fn near_cube(&self, places: &SolidPlaces, cube: usize) -> NearCube {
         let [u_m, way_m] = self.middle_motion_m(places, cube);
-        let middle_m = model.end_at_rest_m(cube) + u_m;
-        if !is_near(middle_m, REACH) {
-            return;
-        }
-        let [least_m, most_m] = sweep.bounds_m();
-        for axis in 0..AXES {
-            let number = 2 * axis;
-            let Some(other) = places.cube_across(cube, axis, true) else { continue };
-            if tables.severed.has(model.first_end(cube) + number) {
-                continue;
-            }
-            let [other_u_m, other_way_m] = self.middle_motion_m(places, other);
-            let span_m = model.unit_m * DVec3::AXES[axis] + (other_u_m - u_m);
-            let moved_m = 0.5 * (way_m + other_way_m);
-            let (low_m, high_m) = (span_m.min(DVec3::ZERO), span_m.max(DVec3::ZERO));
-            let slack_m = moved_m.abs();
-            if (middle_m + high_m + slack_m).cmplt(least_m).any() || (middle_m + low_m - slack_m).cmpgt(most_m).any() {
-                continue;
-            }
-            if let Some(part) = sweep.crosses(middle_m, span_m, moved_m) {
-                let rest = DVec3::AXES[axis];
-                let spring = SpringEnd { number, other, rest, stiffness_n_per_m: 0.0, tension_n_per_m: 0.0 };
-                found.push(Crossing { place: cube, spring, part });
-            }
-        }
+        NearCube { cube, middle_m: self.model.end_at_rest_m(cube) + u_m, u_m, way_m }
     }
 
     /// Returns the displacement of the end of a spring and its way in this step, m: in a solid of the middle of a cube.
@@ -205,6 +234,12 @@ impl<T: Real> TissueState<T> {
         let point = model.point_of(place);
         tables.springs.gather(&tables.severed, &tables.layout, &state.u, 0.0, point).map(Real::wide)
     }
+}
+
+/// Returns whether a place is within a distance of a box along each axis, m.
+#[inline]
+fn is_within([least_m, most_m]: [DVec3; 2], reach_m: f64, place_m: DVec3) -> bool {
+    place_m.cmpge(least_m - reach_m).all() && place_m.cmple(most_m + reach_m).all()
 }
 
 #[cfg(test)]

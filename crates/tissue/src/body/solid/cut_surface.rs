@@ -1,0 +1,298 @@
+//! The surface within the cuts of a solid, for viewers: both sides of each severed face, smoothed along the way of the blade.
+//!
+//! A severed face was crossed at one place of the line between the middles of its cubes. Each corner of severed faces gets a vertex: the
+//! corner, moved along one axis to the plane that fits the crossings around it best. So the faces, which are steps of the lattice, become a
+//! smooth surface through the places that were crossed; a straight cut is plane up to its edges. (A surface net moves vertices to the mean of the
+//! crossings: Gibson, Constrained elastic surface nets, MICCAI 1998. Its edges would be half a cube too far inside.) A face is
+//! shown twice, once for each of its cubes. A vertex moves with a cube on its own side. Where a cut ends, corners are not
+//! doubled, and both sides have the same vertices.
+//!
+//! The lattice reaches beyond the surface of the tissue: vertices outside are moved to the nearest place of it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::{DMat3, DVec3};
+
+use crate::body::model::Model;
+use crate::body::severed::Cuts;
+use crate::body::solid::corner_copies::{CornerCopies, corners_of};
+use crate::body::solid::places::SolidPlaces;
+use crate::scene::CORNERS;
+
+/// A vertex of the surface within a cut.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CutVertex {
+    /// Its rest position, m, in the tissue's frame.
+    pub rest_m: DVec3,
+    /// The corners of the cell that it moves with, by their places in
+    /// [`Tissue::shown_displacements_m`](crate::Tissue::shown_displacements_m), x before y before z.
+    pub corners: [u32; 8],
+    /// Their trilinear weights, with the sum 1. The vertex may be outside the cell: then some are negative.
+    pub weights: [f64; 8],
+    /// The version of the topology since which it has this rest position.
+    pub version: u32,
+}
+
+/// One side of a severed face.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CutFace {
+    /// Its number: 2n and 2n + 1 for the n-th severed face.
+    pub number: u32,
+    /// Its vertices, counter-clockwise seen from within the cut.
+    pub corners: [u32; 4],
+    /// The version of the topology since which it has these.
+    pub version: u32,
+}
+
+/// The surface within the cuts of a solid. While cuts only grow, vertices and faces keep their numbers.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct CutSurface {
+    /// The vertices, in the order of the versions in which they appeared.
+    pub vertices: Vec<CutVertex>,
+    /// The faces, ascending by number; those outside the tissue are left out.
+    pub faces: Vec<CutFace>,
+}
+
+impl Model {
+    /// Returns the largest number of vertices of a [`CutSurface`]: two for each spare place of a solid, 0 for other tissues.
+    pub fn most_cut_vertices(&self) -> usize {
+        self.places.solid().map_or(0, |places| VERTICES_PER_SPARE * places.spare().len())
+    }
+}
+
+/// A doubled corner has its own vertex and that of its copy.
+const VERTICES_PER_SPARE: usize = 2;
+
+/// A severed face as the search for vertices sees it.
+struct SeveredFace {
+    /// Its corners in the lattice, counter-clockwise seen from its higher cube.
+    corners: [u32; 4],
+    /// The places of these corners for the lower and the higher cube.
+    places: [[u32; 4]; 2],
+    cubes: [u32; 2],
+    version: u32,
+}
+
+/// The crossings of some severed faces.
+#[derive(Debug, Clone, Copy)]
+struct Crossings {
+    /// Number of faces across each axis.
+    axes: [f64; 3],
+    /// The sum of the crossings, and that of their products, from the least corner of the lattice, in edges.
+    sum: DVec3,
+    products: DMat3,
+    /// The versions of the first and the last of these faces.
+    versions: [u32; 2],
+}
+
+/// How much a plane through crossings resists a slope, by the mean square of their distances, in edges: crossings in a row say nothing
+/// about the slope across it.
+const STIFF: f64 = 1e-4;
+
+/// Crossings whose spreads along two axes have a smaller product, in edges⁴, are about in a row: faces of two rows have 1/16 or more.
+const MIN_SPREAD: f64 = 0.03;
+
+/// How often a vertex outside the tissue is moved to the nearest place of its surface and back to the plane.
+const TURNS: usize = 4;
+
+impl Crossings {
+    fn none(version: u32) -> Self {
+        Crossings { axes: [0.0; 3], sum: DVec3::ZERO, products: DMat3::ZERO, versions: [version; 2] }
+    }
+
+    /// Adds the crossing of a face across an axis.
+    fn add_face(&mut self, axis: usize, at: DVec3, version: u32) {
+        self.axes[axis] += 1.0;
+        self.sum += at;
+        self.products += DMat3::from_cols(at.x * at, at.y * at, at.z * at);
+        self.versions[1] = self.versions[1].max(version);
+    }
+
+    fn add(&mut self, other: &Self) {
+        (0..3).for_each(|axis| self.axes[axis] += other.axes[axis]);
+        self.sum += other.sum;
+        self.products += other.products;
+        self.versions[1] = self.versions[1].max(other.versions[1]);
+    }
+
+    /// Returns the axis that most of the faces are across, and the mean of the crossings.
+    fn middle(&self) -> (usize, DVec3) {
+        let axis = (0..3).fold(0, |most, axis| if self.axes[axis] > self.axes[most] { axis } else { most });
+        (axis, self.sum / self.axes.iter().sum::<f64>())
+    }
+
+    /// Returns the mean product of the distances of the crossings from their mean along two axes.
+    fn spread(&self, p: usize, q: usize) -> f64 {
+        let (_, mean) = self.middle();
+        self.products.col(p)[q] / self.axes.iter().sum::<f64>() - mean[p] * mean[q]
+    }
+
+    /// Returns whether the crossings are far enough from being in a row to tell a plane.
+    fn tells_plane(&self) -> bool {
+        let (axis, _) = self.middle();
+        let [b, c] = [(axis + 1) % 3, (axis + 2) % 3];
+        self.spread(b, b) * self.spread(c, c) - self.spread(b, c).powi(2) > MIN_SPREAD
+    }
+
+    /// Returns the place of the vertex of a corner, m, and whether it was outside the tissue: then it is moved to the surface, within the
+    /// plane as nearly as a few turns allow.
+    fn vertex_m(&self, places: &SolidPlaces, corner: usize) -> (DVec3, bool) {
+        let mut at_m = places.at_m(self.moved(places.coordinates(corner)));
+        // It is no farther from the corner than the cubes around it reach.
+        let around = [0, 1].into_iter().flat_map(|beside| places.cubes_around(corner, beside));
+        if around.flatten().filter(|cube| places.cube_mass(*cube) >= 1.0).count() == 8 {
+            return (at_m, false);
+        }
+        let surface = places.shown_surface();
+        let mut was_outside = false;
+        for _ in 0..TURNS {
+            let Some(place) = surface.nearest(at_m) else { break };
+            let nearest_m = surface.at_m(&place);
+            let [along, across] = place.frame;
+            if along.cross(across).dot(at_m - nearest_m) <= 0.0 {
+                break;
+            }
+            was_outside = true;
+            at_m = places.at_m(self.moved(places.coordinates_at(nearest_m)));
+        }
+        (at_m, was_outside)
+    }
+
+    /// Returns where a place is moved to along one axis: onto the plane that fits the crossings best, by at most an edge.
+    fn moved(&self, corner: DVec3) -> DVec3 {
+        let (axis, mean) = self.middle();
+        let [b, c] = [(axis + 1) % 3, (axis + 2) % 3];
+        let spread = |p: usize, q: usize| self.spread(p, q);
+        let [own_b, own_c, mixed] = [spread(b, b) + STIFF, spread(c, c) + STIFF, spread(b, c)];
+        let area = own_b * own_c - mixed * mixed;
+        let slope_b = (own_c * spread(axis, b) - mixed * spread(axis, c)) / area;
+        let slope_c = (own_b * spread(axis, c) - mixed * spread(axis, b)) / area;
+        let at = mean[axis] + slope_b * (corner[b] - mean[b]) + slope_c * (corner[c] - mean[c]);
+        let mut moved = corner;
+        moved[axis] = at.clamp(corner[axis] - 1.0, corner[axis] + 1.0);
+        moved
+    }
+}
+
+impl CutSurface {
+    /// Returns the surface within the cuts of a tissue; empty for one that is no solid. `model` is that of the tissue.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn of(model: &Model, cuts: &Cuts) -> Self {
+        let (Some(places), Some(copies)) = (model.places.solid(), cuts.copies()) else { return CutSurface::default() };
+        let mut corners: BTreeMap<u32, Crossings> = BTreeMap::new();
+        let faces: Vec<SeveredFace> = cuts
+            .springs()
+            .iter()
+            .map(|spring| {
+                let axis = spring.number as usize / 2;
+                let face = SeveredFace::of(places, copies, spring.ends, axis, spring.version);
+                let crossing = places.coordinates(spring.ends[0] as usize) + 0.5 + spring.part * DVec3::AXES[axis];
+                for corner in face.corners {
+                    let known = corners.entry(corner).or_insert_with(|| Crossings::none(face.version));
+                    known.add_face(axis, crossing, face.version);
+                }
+                face
+            })
+            .collect();
+        // A plane through the crossings around a corner and around those beside it; one more round if these are in a row.
+        let mut beside: BTreeSet<[u32; 2]> = BTreeSet::new();
+        for face in &faces {
+            beside.extend(face.corners.iter().flat_map(|one| face.corners.map(|other| [*one, other])));
+        }
+        let gathered = |of: &BTreeMap<u32, Crossings>| {
+            let mut around: BTreeMap<u32, Crossings> = BTreeMap::new();
+            for [corner, other] in &beside {
+                let none = || Crossings::none(of[corner].versions[0]);
+                around.entry(*corner).or_insert_with(none).add(&of[other]);
+            }
+            around
+        };
+        let near = gathered(&corners);
+        let mut around = gathered(&near);
+        for (corner, crossings) in near {
+            if crossings.tells_plane() {
+                around.insert(corner, crossings);
+            }
+        }
+        // A vertex for each place of a corner, by the version since which it is one.
+        let since = |corner: u32, place: u32| match copies.since(place as usize) {
+            Some(version) => version,
+            None => corners[&corner].versions[0],
+        };
+        let mut uses: BTreeMap<[u32; 2], (u32, u32)> = BTreeMap::new();
+        for face in &faces {
+            for (places, cube) in face.places.iter().zip(face.cubes) {
+                for (place, corner) in places.iter().zip(face.corners) {
+                    uses.entry([since(corner, *place), *place]).or_insert((corner, cube));
+                }
+            }
+        }
+        let rest_m = |(corner, crossings): (&u32, &Crossings)| (*corner, crossings.vertex_m(places, *corner as usize));
+        let rest_m: BTreeMap<u32, (DVec3, bool)> = around.iter().map(rest_m).collect();
+        let most = model.most_cut_vertices();
+        let vertices = uses.iter().take(most).map(|([since, _], (corner, cube))| CutVertex {
+            version: (*since).max(around[corner].versions[1]),
+            ..vertex_in(places, copies, *cube as usize, rest_m[corner].0)
+        });
+        let vertices = vertices.collect();
+        let number_of: BTreeMap<u32, (u32, u32)> =
+            uses.keys().take(most).zip(0..).map(|([since, place], number)| (*place, (number, *since))).collect();
+        let mut shown = Vec::new();
+        for (face, number) in faces.iter().zip(0..) {
+            if face.corners.iter().all(|corner| rest_m[corner].1) {
+                continue;
+            }
+            for side in 0..2_u32 {
+                let found = face.places[side as usize].map(|place| number_of.get(&place));
+                let [Some(a), Some(b), Some(c), Some(d)] = found else { continue };
+                let version = [a.1, b.1, c.1, d.1].into_iter().fold(face.version, u32::max);
+                // Seen from within the cut, from the other cube.
+                let corners = if side == 0 { [a.0, b.0, c.0, d.0] } else { [d.0, c.0, b.0, a.0] };
+                shown.push(CutFace { number: 2 * number + side, corners, version });
+            }
+        }
+        CutSurface { vertices, faces: shown }
+    }
+
+    /// Returns the vertices that are new or have moved since a version of the topology, with their numbers.
+    pub fn vertices_since(&self, version: u32) -> impl Iterator<Item = (u32, &CutVertex)> {
+        (0..).zip(&self.vertices).filter(move |(_, vertex)| vertex.version > version)
+    }
+
+    /// Returns the faces that are new or have other vertices since a version of the topology.
+    pub fn faces_since(&self, version: u32) -> impl Iterator<Item = &CutFace> {
+        self.faces.iter().filter(move |face| face.version > version)
+    }
+}
+
+impl SeveredFace {
+    /// Describes the face between two cubes, the second of which is beyond the first along an axis.
+    #[allow(clippy::cast_possible_truncation)]
+    fn of(places: &SolidPlaces, copies: &CornerCopies, cubes: [u32; 2], axis: usize, version: u32) -> Self {
+        let [second, third] = [(axis + 1) % 3, (axis + 2) % 3].map(|axis| 1 << axis);
+        let around = [0, second, second | third, third];
+        let bits = [1 << axis, 0];
+        let [lower, higher] = cubes.map(|cube| cube as usize);
+        let in_lattice = places.corners_of(higher);
+        let of_side = |cube: usize, bit: usize| {
+            let corners = corners_of(places, Some(copies), cube);
+            around.map(|number| corners[number | bit] as u32)
+        };
+        SeveredFace {
+            corners: around.map(|number| in_lattice[number] as u32),
+            places: [of_side(lower, bits[0]), of_side(higher, bits[1])],
+            cubes,
+            version,
+        }
+    }
+}
+
+/// Returns a vertex at a rest position, m, that moves with a cube.
+#[allow(clippy::cast_possible_truncation)]
+fn vertex_in(places: &SolidPlaces, copies: &CornerCopies, cube: usize, rest_m: DVec3) -> CutVertex {
+    let part = (rest_m - places.rest_m(cube)) / places.edge_m();
+    let weight =
+        |by: [usize; 3]| (0..3).map(|axis| if by[axis] == 1 { part[axis] } else { 1.0 - part[axis] }).product();
+    let corners = corners_of(places, Some(copies), cube).map(|place| place as u32);
+    CutVertex { rest_m, corners, weights: CORNERS.map(weight), version: 0 }
+}
