@@ -22,7 +22,7 @@ use tokio::sync::{Mutex, oneshot};
 
 use crate::arrays::vector;
 use crate::device::Given;
-use crate::error::{of_client, of_status, refused, wrong};
+use crate::error::{has_reason, of_client, of_status, refused, wrong};
 use crate::exercise::{self, KnownExercise, LiveMeasures, SessionTask, ToldResult};
 use crate::hand::Hand;
 use crate::instrument::Instrument;
@@ -253,6 +253,18 @@ fn bites(places_m: &[Bound<'_, PyAny>], radius_m: f64) -> PyResult<Vec<pb::Bite>
 }
 
 impl RemoteSession {
+    /// Deletes the session at the end of a `with` block. A trainee only leaves it: it is the trainer's.
+    fn leave<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let (session, session_id) = self.own();
+        answer(py, self.awaited, async move {
+            let request = pb::DeleteSessionRequest { session_id };
+            match called!(session, SessionServiceClient.delete_session(request)) {
+                Err(error) if has_reason(&error, Reason::NotForTrainee) => Ok(NOTHING),
+                other => other.map(|_| NOTHING),
+            }
+        })
+    }
+
     fn of(session: Followed, scene: Option<Arc<scene::Scene>>, awaited: bool) -> Self {
         let session = Arc::new(session);
         let held = Arc::new(HeldTools::new(session.clone(), HOLDER));
@@ -703,7 +715,7 @@ impl RemoteSession {
 
     #[pyo3(signature = (*_raised))]
     fn __exit__<'py>(&self, py: Python<'py>, _raised: &Bound<'py, PyAny>) -> PyResult<()> {
-        self.delete(py).map(drop)
+        self.leave(py).map(drop)
     }
 
     fn __aenter__<'py>(slf: Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
@@ -713,7 +725,7 @@ impl RemoteSession {
 
     #[pyo3(signature = (*_raised))]
     fn __aexit__<'py>(&self, py: Python<'py>, _raised: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
-        self.delete(py)
+        self.leave(py)
     }
 
     fn __repr__(&self) -> String {

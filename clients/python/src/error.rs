@@ -1,7 +1,7 @@
 //! Converts refusals and failures to the exceptions of `palpate._errors`.
 
-use palpate_refusal::Refusal;
 use palpate_refusal::printable::printable;
+use palpate_refusal::{Reason, Refusal};
 use palpate_session::simulation::SimulationFailure;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyOSError};
 use pyo3::prelude::*;
@@ -28,7 +28,16 @@ pub(crate) fn refused(refusal: Refusal) -> PyErr {
 
 /// Returns `palpate.Refused` for an argument of the wrong kind.
 pub(crate) fn wrong(field: &str, message: impl Into<String>) -> PyErr {
-    refused(Refusal::new(palpate_refusal::Reason::WrongKind, field, message))
+    refused(Refusal::new(Reason::WrongKind, field, message))
+}
+
+/// Returns whether an exception is a refusal for this reason.
+pub(crate) fn has_reason(error: &PyErr, reason: Reason) -> bool {
+    let is = |py: Python<'_>| {
+        let known = error.value(py).getattr("reason").and_then(|known| known.extract::<String>());
+        known.is_ok_and(|known| known == reason.as_str())
+    };
+    ending::attached(is).unwrap_or(false)
 }
 
 /// Returns `palpate.Failed`: the tissue could not continue.
@@ -67,7 +76,7 @@ pub(crate) fn of_client(error: palpate_client::Error) -> PyErr {
     let text = error.to_string();
     match error {
         Error::Call(status) => of_status(status),
-        Error::Argument(message) => refused(Refusal::new(palpate_refusal::Reason::OutOfRange, "", message)),
+        Error::Argument(message) => refused(Refusal::new(Reason::OutOfRange, "", message)),
         Error::Connection(_) => raised("Disconnected", (text,)),
         // An exception that a Python device raised is raised again unchanged.
         Error::Device(error) => match error.downcast::<PyErr>() {

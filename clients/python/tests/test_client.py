@@ -329,6 +329,8 @@ class Clients(Served, unittest.TestCase):
             with self.assertRaises(palpate.Refused) as raised:
                 trainee.save()
             self.assertEqual(raised.exception.reason, "NOT_FOR_TRAINEE")
+            with server.session(told["trainee_id"]):
+                pass  # A trainee leaves; the session stays.
             session.advise("press deeper", place_m=(0.01, 0.0, 0.04))
             live, seen = session.measures(), trainee.measures()
             self.assertEqual(next(seen)["advice"], [{"number": 1, "text": "press deeper", "place_m": (0.01, 0.0, 0.04)}])

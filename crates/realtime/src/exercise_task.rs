@@ -32,8 +32,23 @@ pub(super) struct ExerciseTask {
     every: u64,
     /// The step of the newest figures that were asked for.
     asked_step: u64,
-    /// Whether the result was asked for.
-    is_over: bool,
+    /// Whether the result is computed or known.
+    is_over: Arc<AtomicBool>,
+}
+
+/// Clears a flag when it is dropped: also when a computation is refused memory, which unwinds. Then it can be asked for again.
+struct ClearsFlag(Option<Arc<AtomicBool>>);
+
+impl ClearsFlag {
+    fn keep(mut self) {
+        self.0 = None;
+    }
+}
+
+impl Drop for ClearsFlag {
+    fn drop(&mut self) {
+        self.0.iter().for_each(|flag| flag.store(false, Ordering::Release));
+    }
 }
 
 impl ExerciseTask {
@@ -47,8 +62,8 @@ impl ExerciseTask {
         let mut run = MeasuredRun::new(model, begin_step, thresholds(&chosen.exercise), None, Some(chosen))?;
         run.see(session);
         let every = (model.scene.stepping.rate_hz / TOLD_HZ).round().max(1.0) as u64;
-        let is_computing = Arc::default();
-        Ok(ExerciseTask { live: live.clone(), is_computing, run, every, asked_step: begin_step, is_over: false })
+        let [is_computing, is_over] = [Arc::default(), Arc::default()];
+        Ok(ExerciseTask { live: live.clone(), is_computing, run, every, asked_step: begin_step, is_over })
     }
 
     /// Takes the session after a step.
@@ -58,7 +73,7 @@ impl ExerciseTask {
 
     /// Returns the step that a session at rest must do next, because figures are due after it; `u64::MAX` if there is none.
     pub(super) fn next_wanted(&self, step: u64) -> u64 {
-        if self.is_over {
+        if self.is_over.load(Ordering::Acquire) {
             return u64::MAX;
         }
         let due = (step + 1).next_multiple_of(self.every);
@@ -67,7 +82,7 @@ impl ExerciseTask {
 
     /// Has the figures computed that are due after a step.
     pub(super) fn tell(&mut self, session: &Session, to: (u64, &Arc<Inbox>), account: &Account, reading: &Reading) {
-        if self.is_over {
+        if self.is_over.load(Ordering::Acquire) {
             return;
         }
         if self.run.ended().is_some() {
@@ -79,10 +94,11 @@ impl ExerciseTask {
             return;
         }
         self.asked_step = step;
-        let (live, is_computing, moment) = (self.live.clone(), self.is_computing.clone(), self.run.moment(session));
+        let computed = ClearsFlag(Some(self.is_computing.clone()));
+        let (live, moment) = (self.live.clone(), self.run.moment(session));
         let work = move || {
             let figures = moment.figures();
-            is_computing.store(false, Ordering::Release);
+            drop(computed);
             live.tell_figures(figures);
         };
         reading.post(account, Piece::Work(Box::new(work)));
@@ -96,16 +112,39 @@ impl ExerciseTask {
         account: &Account,
         reading: &Reading,
     ) {
-        if std::mem::replace(&mut self.is_over, true) {
+        if self.is_over.swap(true, Ordering::AcqRel) {
             return;
         }
+        let computing = ClearsFlag(Some(self.is_over.clone()));
         let (moment, answers): (MeasuredMoment, _) =
             (self.run.end(session).clone(), self.run.answers(session).to_vec());
         let inbox = inbox.clone();
         let work = move || {
             let ended = EndedExercise { figures: Arc::new(moment.figures()), answers };
             inbox.send(number, Request::ExerciseEnded(Arc::new(ended)));
+            computing.keep();
         };
         reading.post(account, Piece::Work(Box::new(work)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::panic::{AssertUnwindSafe, catch_unwind};
+
+    use super::*;
+
+    #[test]
+    fn a_computation_that_is_refused_memory_can_be_asked_for_again() {
+        let flag = Arc::new(AtomicBool::new(true));
+        let computing = ClearsFlag(Some(flag.clone()));
+        let refused = catch_unwind(AssertUnwindSafe(move || {
+            let _computing = computing;
+            std::panic::resume_unwind(Box::new("refused"));
+        }));
+        assert!(refused.is_err() && !flag.load(Ordering::Acquire));
+        flag.store(true, Ordering::Release);
+        ClearsFlag(Some(flag.clone())).keep();
+        assert!(flag.load(Ordering::Acquire));
     }
 }
