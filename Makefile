@@ -55,7 +55,7 @@ help:
 	@echo 'make site            the guide as a site with search, target/site/index.html; fails on a broken link or a missing picture'
 	@echo 'make screenshot      the screenshot of the README'
 	@echo 'make page-states     a picture of each state of the page, at three widths, light and dark, in target/viewer/states'
-	@echo 'make film            pictures and a film of two hands on the page: one lifts a gallbladder, one strokes it; target/viewer/two-hands'
+	@echo 'make film            pictures and films of the page: two hands lift and stroke a gallbladder, a cut is sutured; target/viewer'
 	@echo 'make scene-pictures  the pictures of the scenes in the list of the page'
 	@echo 'make bench-roundtrip the haptic round trip compared with a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'

@@ -137,15 +137,17 @@ export async function callSession({ url }, method, sessionId) {
 
 /**
  * A folder with the shipped scenes, in which a blade feels nothing: on a busy machine a touch begins anew again and again, and tough tissue
- * that was pushed is whole then. The caller removes it.
+ * that was pushed is whole then. In `liver` a wound gapes by a pretension, N/m. The caller removes the folder.
  */
-export function scenesToCut() {
+export function scenesToCut(pretensionNPerM = 0) {
   const folder = mkdtempSync(join(tmpdir(), "palpate-scenes-"));
   cpSync(join(ROOT, "scenes"), folder, { recursive: true });
   const liver = readFileSync(join(folder, "liver.toml"), "utf8");
   const soft = liver.replace(/^toughness_j_per_m2 = .*$/m, "toughness_j_per_m2 = 0.0");
   if (soft === liver) throw new Error("the scene has no toughness to take out");
-  writeFileSync(join(folder, "liver.toml"), soft);
+  const tense = soft.replace("[springs]", `[springs]\npretension_n_per_m = ${pretensionNPerM.toFixed(1)}\n#`);
+  if (tense === soft) throw new Error("the scene has no springs");
+  writeFileSync(join(folder, "liver.toml"), tense);
   return folder;
 }
 
