@@ -38,5 +38,5 @@ pub(super) struct DrawnWound {
     /// The ends of the lines along both lips, by the vertices of the surface.
     pub(super) lips: Vec<[usize; 2]>,
     /// The triangles of the surface within the cuts of a solid, which has no bed.
-    pub(super) within: Vec<[Vertex; 3]>,
+    pub(super) cut_surface: Vec<[Vertex; 3]>,
 }

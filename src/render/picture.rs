@@ -93,7 +93,7 @@ const WOUND: [[u8; 3]; 2] = [[96, 12, 14], [58, 8, 10]];
 const PALE_WOUND: [[u8; 3]; 2] = [[176, 96, 92], [96, 36, 34]];
 
 /// What the surface within a cut reflects of red, green and blue, beside the surface of the tissue.
-const CUT_FACE: DVec3 = DVec3::new(0.80, 0.50, 0.46);
+const CUT_FACE: DVec3 = DVec3::new(0.60, 0.34, 0.32);
 
 /// Width of the line along a lip, as a fraction of the picture's width.
 const LIP: f64 = 0.0016;
@@ -180,7 +180,7 @@ pub fn picture(
             canvas.triangle([p, q, r], |_| inside);
         }
     }
-    for vertices in &surface.wound.within {
+    for vertices in &surface.wound.cut_surface {
         let corners = vertices.map(|vertex| eye.project(vertex.at_m, nearest_m));
         let [Some(p), Some(q), Some(r)] = corners else { continue };
         canvas.triangle([p, q, r], |shares| match &skin {

@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::drawn_surface::{DrawnSurface, DrawnWound, Vertex};
-use super::wound::{open_wound, show_within};
+use super::wound::{open_wound, show_cut_surface};
 use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, Wound, encode};
 use palpate_tissue::shape::RestShape;
 
@@ -71,9 +71,11 @@ impl DrawnSurface {
         if let Some(wound) = wound {
             open_wound(&mut surface, wound, |place| rest_m[place], shape.edge_m());
         }
-        let within = skin.cut_surface(snapshot.cuts());
-        if !within.faces.is_empty() {
-            show_within(&mut surface, &within, &moved_m[skin.first_cut_place()..], |at_m| (at_m - least_m) / longest_m);
+        let cut_surface = skin.cut_surface(snapshot.cuts());
+        if !cut_surface.faces.is_empty() {
+            show_cut_surface(&mut surface, &cut_surface, &moved_m[skin.first_cut_place()..], |at_m| {
+                (at_m - least_m) / longest_m
+            });
         }
         let facing = |place: usize| match wound.and_then(|wound| wound.vertices.get(place.checked_sub(rest_m.len())?)) {
             Some(lip) => at_rest[lip.host as usize].abs(),

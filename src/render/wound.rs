@@ -29,22 +29,22 @@ pub(super) fn open_wound(surface: &mut DrawnSurface, wound: &Wound, rest_m: impl
     if !wound.triangles.is_empty() {
         draw_lines(surface, wound);
     }
-    surface.wound = DrawnWound { bed_m, lips, within: Vec::new() };
+    surface.wound = DrawnWound { bed_m, lips, cut_surface: Vec::new() };
 }
 
 /// Shows the surface within the cuts of a solid in place of the tissue beneath the lips. `moved_m` has the displacements of its vertices, m;
 /// `share` returns a rest position as a part of the longest side.
-pub(super) fn show_within(
+pub(super) fn show_cut_surface(
     surface: &mut DrawnSurface,
-    within: &CutSurface,
+    cut_surface: &CutSurface,
     moved_m: &[DVec3],
     share: impl Fn(DVec3) -> DVec3,
 ) {
     let at = |corner: u32| {
-        let rest_m = within.vertices[corner as usize].rest_m;
+        let rest_m = cut_surface.vertices[corner as usize].rest_m;
         (rest_m, rest_m + moved_m.get(corner as usize).copied().unwrap_or_default())
     };
-    let triangles = within.faces.iter().flat_map(|face| {
+    let triangles = cut_surface.faces.iter().flat_map(|face| {
         let [a, b, c, d] = face.corners.map(at);
         [[a, b, c], [a, c, d]]
     });
@@ -60,7 +60,7 @@ pub(super) fn show_within(
             open: 1.0,
         })
     });
-    surface.wound.within = drawn.collect();
+    surface.wound.cut_surface = drawn.collect();
     surface.wound.bed_m.clear();
 }
 

@@ -161,6 +161,7 @@ impl ViewService for Views {
         let mut grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
         if let Some(skin) = handle.skin.as_ref().filter(|_| request.cut_surface) {
             grid = skin.with_cut_surface(grid);
+            grid.check("cut_surface", &self.0.config.limits)?;
         }
         let encoding = wire::sample::from_encoding(request.encoding)?;
         let most_hz = handle.model.scene.stepping.rate_hz;

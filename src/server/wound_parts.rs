@@ -6,7 +6,7 @@ use palpate_session::surface::wound::{CutTriangles, LipVertex, Wound};
 use palpate_session::surface::{Refinement, Skin};
 use palpate_tissue::{CutFace, CutVertex};
 
-/// Number of new vertices and of changed runs of triangles in a message: about 100 KiB.
+/// Number of entries of all lists in a message: about 100 KiB.
 const ENTRIES_PER_MESSAGE: usize = 2048;
 
 /// The wound of a session's surface, as far as a client does not know it.

@@ -1,5 +1,6 @@
 // The wound that blades have made in a surface, as `GetWound` returns it: vertices and triangles in place of those that the cut
-// crosses. Each new vertex moves as its host does, so that frames need no more than they have.
+// crosses. Each new vertex moves as its host does, so that frames need no more than they have. Within the cut of a solid there are faces of
+// their own, whose vertices are in frames.
 
 import type { CutFace, CutTriangles, CutVertex, GetWoundResponse, LipVertex } from "./gen/palpate/v1/view_pb.js";
 import { CALL_TIMEOUT_MS, type Server } from "./server.js";
@@ -25,7 +26,7 @@ export interface WoundChange {
   /** Changed triangles; some may replace earlier ones with the same `first`. */
   cuts: Cut[];
   /** Whether the surface within cuts has changed. */
-  isWithin: boolean;
+  hasNewCutSurface: boolean;
 }
 
 /** Maximum number of values of a wound: more than any mesh has that a browser shows. */
@@ -55,7 +56,7 @@ export class Wound {
   constructor(
     readonly vertexCount: number,
     readonly triangleCount: number,
-    readonly mostCutVertices = 0,
+    readonly maxCutVertices = 0,
   ) {}
 
   /** Takes all parts of an answer that asked for what is new since `version`. Throws if they don't fit, and changes nothing then. */
@@ -76,27 +77,27 @@ export class Wound {
     // Otherwise hiding them would have no end.
     const hidden = cuts.reduce((sum, { count }) => sum + count, 0);
     if (!vertices.every(isLip) || !cuts.every(isCut) || hidden > this.triangleCount) throw new RangeError("the server's wound is not whole");
-    const within = parts.flatMap((part) => part.cutVertices);
+    const cutVertices = parts.flatMap((part) => part.cutVertices);
     const faces = parts.flatMap((part) => part.cutFaces);
-    this.checkWithin(within, faces, isNew);
+    this.checkCutSurface(cutVertices, faces, isNew);
     if (isNew) {
       this.vertices.length = this.cutRestM.length = 0;
       this.cuts.clear();
       this.cutFaces.clear();
     }
-    for (const { number, restXM, restYM, restZM } of within) [restXM, restYM, restZM].forEach((m, c) => (this.cutRestM[3 * number + c] = m));
+    for (const { number, restXM, restYM, restZM } of cutVertices) [restXM, restYM, restZM].forEach((m, c) => (this.cutRestM[3 * number + c] = m));
     for (const { number, corners } of faces) this.cutFaces.set(number, corners);
     for (const lip of vertices) this.vertices.push(lip);
     for (const cut of cuts) this.cuts.set(cut.first, cut);
     ({ version: this.version, severed: this.severed, pieces: this.pieces, staysWhole: this.staysWhole } = first);
-    return { isNew, cuts, isWithin: isNew || within.length > 0 || faces.length > 0 };
+    return { isNew, cuts, hasNewCutSurface: isNew || cutVertices.length > 0 || faces.length > 0 };
   }
 
   /** Throws unless these vertices continue those that are known, without gaps, and the faces have vertices. */
-  private checkWithin(vertices: Part["cutVertices"], faces: Part["cutFaces"], isNew: boolean): void {
+  private checkCutSurface(vertices: Part["cutVertices"], faces: Part["cutFaces"], isNew: boolean): void {
     let count = isNew ? 0 : this.cutRestM.length / 3;
     for (const { number, restXM, restYM, restZM } of vertices) {
-      if (number > count || number >= this.mostCutVertices || ![restXM, restYM, restZM].every(Number.isFinite)) {
+      if (number > count || number >= this.maxCutVertices || ![restXM, restYM, restZM].every(Number.isFinite)) {
         throw new RangeError("the server's surface within cuts is not whole");
       }
       count = Math.max(count, number + 1);
@@ -143,7 +144,7 @@ export function mixed({ host, second, third, secondPart, thirdPart }: Lip, value
 export async function followWound(server: Server, sessionId: string, refinement: number, wound: Wound, signal?: AbortSignal): Promise<WoundChange> {
   const parts: GetWoundResponse[] = [];
   let numbers = 0;
-  const request = { sessionId, refinement, sinceVersion: wound.version, cutSurface: wound.mostCutVertices > 0 };
+  const request = { sessionId, refinement, sinceVersion: wound.version, cutSurface: wound.maxCutVertices > 0 };
   for await (const part of server.views.getWound(request, { signal, timeoutMs: CALL_TIMEOUT_MS })) {
     numbers += 1 + part.vertices.length + part.triangles.reduce((sum, { corners }) => sum + 1 + corners.length, 0);
     numbers += part.cutVertices.length + part.cutFaces.reduce((sum, { corners }) => sum + 1 + corners.length, 0);

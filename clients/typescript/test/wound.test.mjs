@@ -6,7 +6,8 @@ import { test } from "node:test";
 import { Wound } from "palpate";
 
 /**
- * @typedef {{ firstVertex: number, vertices: import("palpate").Lip[], triangles: import("palpate").Cut[] }} Delta
+ * @typedef {{ number: number, restXM: number, restYM: number, restZM: number }} CutVertex
+ * @typedef {{ firstVertex: number, vertices: import("palpate").Lip[], triangles: import("palpate").Cut[], cutVertices?: CutVertex[], cutFaces?: { number: number, corners: number[] }[] }} Delta
  * @typedef {{ restM: number[], triangles: number[], displacementM: number[], first: Delta, second: Delta, shownM: number[], shownTriangles: number[][] }} Known
  */
 
@@ -14,7 +15,7 @@ import { Wound } from "palpate";
 const known = JSON.parse(readFileSync(new URL("wound.json", import.meta.url), "utf8"));
 
 /** @param {Delta} delta @param {number} version @param {boolean} continues */
-const part = (delta, version, continues) => ({ cutVertices: [], cutFaces: [], ...delta, version, continues, severed: 11, pieces: 2, staysWhole: false });
+const part = ({ cutVertices = [], cutFaces = [], ...delta }, version, continues) => ({ ...delta, cutVertices, cutFaces, version, continues, severed: 11, pieces: 2, staysWhole: false });
 
 const begun = () => new Wound(known.restM.length / 3, known.triangles.length / 3);
 
@@ -66,7 +67,7 @@ test("a wound that does not fit is refused, and changes nothing", () => {
   assert.deepEqual([wound.version, wound.vertices.length], [3, known.first.vertices.length]);
 });
 
-const within = {
+const cutSurface = {
   firstVertex: 0,
   vertices: [],
   triangles: [],
@@ -76,21 +77,21 @@ const within = {
 
 test("the surface within cuts is followed, and what changes is replaced", () => {
   const wound = new Wound(16, 18, 6);
-  assert.equal(wound.take([part(within, 3, true)]).isWithin, true);
+  assert.equal(wound.take([part(cutSurface, 3, true)]).hasNewCutSurface, true);
   const moved = { number: 1, restXM: 9, restYM: 8, restZM: 7 };
   const added = { number: 4, restXM: 4, restYM: 4, restZM: 4 };
-  const later = { ...within, cutVertices: [moved, added], cutFaces: [{ number: 0, corners: [0, 1, 4, 3] }, { number: 5, corners: [4, 3, 1, 0] }] };
+  const later = { ...cutSurface, cutVertices: [moved, added], cutFaces: [{ number: 0, corners: [0, 1, 4, 3] }, { number: 5, corners: [4, 3, 1, 0] }] };
   wound.take([part(later, 5, true)]);
   assert.deepEqual(wound.cutRestM, [0, 0.5, -0, 9, 8, 7, 2, 0.5, -2, 3, 0.5, -3, 4, 4, 4]);
   assert.deepEqual([...wound.cutFaces], [[0, [0, 1, 4, 3]], [5, [4, 3, 1, 0]]]);
-  assert.equal(wound.take([part({ ...within, cutVertices: [], cutFaces: [] }, 6, true)]).isWithin, false);
-  wound.take([part({ ...within, cutVertices: [], cutFaces: [] }, 7, false)]);
+  assert.equal(wound.take([part({ ...cutSurface, cutVertices: [], cutFaces: [] }, 6, true)]).hasNewCutSurface, false);
+  wound.take([part({ ...cutSurface, cutVertices: [], cutFaces: [] }, 7, false)]);
   assert.deepEqual([wound.cutRestM.length, wound.cutFaces.size], [0, 0]);
 });
 
 test("a surface within cuts that does not fit is refused, and changes nothing", () => {
   const wound = new Wound(16, 18, 6);
-  wound.take([part(within, 3, true)]);
+  wound.take([part(cutSurface, 3, true)]);
   const vertex = (/** @type {number} */ number, restXM = 0) => ({ number, restXM, restYM: 0, restZM: 0 });
   const wrong = [
     { cutVertices: [vertex(5)] },
@@ -99,7 +100,7 @@ test("a surface within cuts that does not fit is refused, and changes nothing", 
     { cutFaces: [{ number: 1, corners: [0, 1, 2] }] },
     { cutFaces: [{ number: 1, corners: [0, 1, 2, 4] }] },
   ];
-  const none = { ...within, cutVertices: [], cutFaces: [] };
+  const none = { ...cutSurface, cutVertices: [], cutFaces: [] };
   for (const delta of wrong) assert.throws(() => wound.take([part({ ...none, ...delta }, 5, true)]), RangeError);
   assert.deepEqual([wound.version, wound.cutRestM.length, wound.cutFaces.size], [3, 12, 1]);
 });

@@ -259,7 +259,7 @@ export class WoundInside extends ShaderMaterial {
  * The surface within the cuts of a solid: the tissue's colour, darker and redder, with grains of some tenths of a millimetre to some
  * millimetres, wet. Its facets are those of the cells.
  */
-export class CutFace extends ShaderMaterial {
+export class CutSurfaceMaterial extends ShaderMaterial {
   constructor() {
     super({
       side: DoubleSide,

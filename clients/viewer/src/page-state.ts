@@ -61,8 +61,8 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     /** What blades have cut, as the server tells it and as it is drawn. */
     get wound() {
       const { session, wound, surface } = present() ?? {};
-      const { shown, waiting, within } = surface?.wound.count ?? { shown: 0, waiting: 0, within: 0 };
-      return { within, severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting, mostAtOnce: surface?.wound.mostAtOnce ?? 0 };
+      const { shown, waiting, cutFaces } = surface?.wound.count ?? { shown: 0, waiting: 0, cutFaces: 0 };
+      return { cutFaces, severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting, mostAtOnce: surface?.wound.mostAtOnce ?? 0 };
     },
     /** The longest times since the last look that the page has worked on a picture, and on a change of the wound, ms. */
     takeLongest(): { pictureMs: number; woundMs: number } {

@@ -31,7 +31,7 @@ import type { ShownGrasper, View } from "./grasper";
 import { GrasperMark, isSamePose } from "./grasper-mark";
 import { Ground } from "./ground";
 import { defaultCameraOfBody, defaultCameraOfSheet } from "./default-camera";
-import { CutFace, light, Skin, SHADOWS, WoundInside } from "./material";
+import { CutSurfaceMaterial, light, Skin, SHADOWS, WoundInside } from "./material";
 import { norm, type Vec3 } from "palpate";
 import type { Lump } from "./lumps";
 import type { Place, Surface } from "./surface";
@@ -93,7 +93,7 @@ export class Stage {
   private markedBalls: Mesh[] = [];
   private readonly inside = new WoundInside(0x5a0d10, 0);
   private readonly lip = new WoundInside(0x2e0608, 5e-4);
-  private readonly cutFace = new CutFace();
+  private readonly cutSurface = new CutSurfaceMaterial();
   /** The parts of cut triangles, the tissue between the lips, the lines along these, and the surface within the cuts of a solid. */
   private wound: [Mesh, Mesh, LineSegments, Mesh] | undefined;
   private mesh: Mesh | undefined;
@@ -190,9 +190,9 @@ export class Stage {
     this.mesh = new Mesh(surface.geometry, skin);
     this.edge = surface.edge && new Mesh(surface.edge.geometry, skin);
     this.lines = new LineSegments(surface.lines, this.wires);
-    const { parts, bed, lips, within } = surface.wound;
-    this.wound = [new Mesh(parts, skin), new Mesh(bed, this.inside), new LineSegments(lips, this.lip), new Mesh(within, this.cutFace)];
-    this.cutFace.follow(skin);
+    const { parts, bed, lips, cutSurface } = surface.wound;
+    this.wound = [new Mesh(parts, skin), new Mesh(bed, this.inside), new LineSegments(lips, this.lip), new Mesh(cutSurface, this.cutSurface)];
+    this.cutSurface.follow(skin);
     this.ground = new Ground(surface, this.colour.table, this.colour.background);
     for (const part of [this.mesh, this.edge, this.lines, this.ground.mesh, ...this.wound]) {
       if (!part) continue;
@@ -245,8 +245,6 @@ export class Stage {
     if (this.mesh) this.mesh.material = on ? this.hidden : this.skin;
     if (this.wound) {
       this.wound[0].material = on ? this.hidden : this.skin;
-      // The tissue between the lips stands for what is within; a solid shows that.
-      this.wound[1].visible = !on && !(this.surface && this.surface.field.cutRows > 0);
       this.wound[3].visible = !on;
     }
     if (this.lines) this.lines.visible = on;
@@ -544,6 +542,8 @@ export class Stage {
     const begunMs = performance.now();
     // The rest of a large wound comes with the next pictures.
     if (this.surface?.refresh()) requestAnimationFrame(() => this.draw());
+    // The tissue between the lips stands for what is within the cut: a solid shows that.
+    if (this.wound) this.wound[1].visible = !this.wireframe && this.surface?.wound.count.cutFaces === 0;
     this.unseenM += this.surface?.takeMoved() ?? 0;
     this.longestMs = Math.max(this.longestMs, performance.now() - begunMs);
     if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * (this.surface?.sizeM ?? 1)) {

@@ -45,8 +45,8 @@ export class ShownWound {
   readonly bed = new BufferGeometry();
   readonly lips = new BufferGeometry();
   /** The surface within the cuts of a solid. */
-  readonly within = new BufferGeometry();
-  private isWithinStale = false;
+  readonly cutSurface = new BufferGeometry();
+  private isCutSurfaceStale = false;
   /** The most cut triangles that one picture took in; for tests. */
   mostAtOnce = 0;
   private wound: Wound | undefined;
@@ -65,16 +65,16 @@ export class ShownWound {
   constructor(private readonly surface: WoundedSurface) {}
 
   /** Number of shown cuts, of those that wait for the next pictures, and of drawn faces within the cuts of a solid. */
-  get count(): { shown: number; waiting: number; within: number } {
-    const within = (this.within.index?.count ?? 0) / 6;
-    return { shown: this.placesOf.size, waiting: this.waiting.length, within };
+  get count(): { shown: number; waiting: number; cutFaces: number } {
+    const cutFaces = (this.cutSurface.index?.count ?? 0) / 6;
+    return { shown: this.placesOf.size, waiting: this.waiting.length, cutFaces };
   }
 
   /** Shows what has changed of a wound. */
-  take(wound: Wound, { isNew, cuts, isWithin }: WoundChange): void {
+  take(wound: Wound, { isNew, cuts, hasNewCutSurface }: WoundChange): void {
     if (isNew) this.clear();
     this.wound = wound;
-    this.isWithinStale ||= isWithin;
+    this.isCutSurfaceStale ||= hasNewCutSurface;
     // Of several with the same first triangle, the last one counts.
     this.waiting = [...new Map([...this.waiting, ...cuts].map((cut) => [cut.first, cut])).values()];
   }
@@ -84,7 +84,7 @@ export class ShownWound {
     [this.waiting, this.places, this.vertexOf.length, this.free.length] = [[], 0, 0, 0];
     this.slotOf.clear();
     this.placesOf.clear();
-    for (const geometry of [this.parts, this.bed, this.lips, this.within]) geometry.setDrawRange(0, 0);
+    for (const geometry of [this.parts, this.bed, this.lips, this.cutSurface]) geometry.setDrawRange(0, 0);
   }
 
   /** The surface has other drawn vertices. */
@@ -101,8 +101,8 @@ export class ShownWound {
     for (const cut of now) this.show(cut);
     if (now.length > 0) this.parts.index!.needsUpdate = this.lips.index!.needsUpdate = true;
     if (this.vertexOf.length > 0 && (hasMoved || now.length > 0 || this.isStale)) this.follow();
-    if (this.isWithinStale) this.buildWithin();
-    else if (hasMoved) this.followWithin();
+    if (this.isCutSurfaceStale) this.buildCutSurface();
+    else if (hasMoved) this.followCutSurface();
     return this.waiting.length > 0;
   }
 
@@ -224,9 +224,9 @@ export class ShownWound {
     this.isStale = false;
   }
 
-  /** Makes the surface within the cuts anew: it has few faces. */
-  private buildWithin(): void {
-    this.isWithinStale = false;
+  /** Makes the surface within the cuts anew, all at once: its faces are those of cells, of which a cut has some thousands at most. */
+  private buildCutSurface(): void {
+    this.isCutSurfaceStale = false;
     const { cutRestM, cutFaces } = this.wound ?? { cutRestM: [], cutFaces: new Map<number, readonly number[]>() };
     const index = new Uint32Array(6 * cutFaces.size);
     let at = 0;
@@ -234,18 +234,18 @@ export class ShownWound {
       index.set([a!, b!, c!, a!, c!, d!], at);
       at += 6;
     }
-    this.within.dispose();
-    this.within.setIndex(new BufferAttribute(index, 1));
-    this.within.setAttribute("rest", new BufferAttribute(Float32Array.from(cutRestM), 3));
-    this.within.setAttribute("position", new BufferAttribute(Float32Array.from(cutRestM), 3).setUsage(DynamicDrawUsage));
-    this.within.setDrawRange(0, at);
-    this.followWithin();
+    this.cutSurface.dispose();
+    this.cutSurface.setIndex(new BufferAttribute(index, 1));
+    this.cutSurface.setAttribute("rest", new BufferAttribute(Float32Array.from(cutRestM), 3));
+    this.cutSurface.setAttribute("position", new BufferAttribute(Float32Array.from(cutRestM), 3).setUsage(DynamicDrawUsage));
+    this.cutSurface.setDrawRange(0, at);
+    this.followCutSurface();
   }
 
   /** Puts the surface within the cuts where the newest frame has it. */
-  private followWithin(): void {
+  private followCutSurface(): void {
     const rest = this.wound?.cutRestM ?? [];
-    const position = this.within.getAttribute("position") as BufferAttribute | undefined;
+    const position = this.cutSurface.getAttribute("position") as BufferAttribute | undefined;
     if (rest.length === 0 || !position || position.array.length !== rest.length) return;
     const { displacementM, nx, ny, cutRows } = this.surface.field;
     const first = 3 * (nx - cutRows) * ny;
@@ -254,6 +254,6 @@ export class ShownWound {
   }
 
   dispose(): void {
-    for (const geometry of [this.parts, this.bed, this.lips, this.within]) geometry.dispose();
+    for (const geometry of [this.parts, this.bed, this.lips, this.cutSurface]) geometry.dispose();
   }
 }

@@ -237,7 +237,7 @@ export class Server {
  *   recording: { sessionId: string, run: number, begin: number, end: number, step: number, isPlaying: boolean, isBusy: boolean, speed: number, playback: string } | undefined,
  *   camera: number[],
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
- *   wound: { severed: number, pieces: number, version: number, vertices: number, shown: number, waiting: number, within: number, mostAtOnce: number },
+ *   wound: { severed: number, pieces: number, version: number, vertices: number, shown: number, waiting: number, cutFaces: number, mostAtOnce: number },
  *   sewing: { ties: { number: number, kind: string | undefined, lengthM: number, pathM: number, tensionN: number, broken: boolean }[], picked: number },
  *   takeLongest: () => { pictureMs: number, woundMs: number },
  *   exercise: { isShown: boolean, isTrainee: boolean, isBriefing: boolean, isDebriefing: boolean, answers: number, advised: number, finished: boolean, scorePercent: number | undefined },

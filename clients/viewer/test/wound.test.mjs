@@ -136,15 +136,15 @@ describe("a blade", () => {
   test("opens a solid, which is seen into", async () => {
     const page = await open(`${server.url}/?scene=liver-solid&tool=blade`);
     await drag(page, [0.42, 0.5], [0.6, 0.5]);
-    await page.until(({ wound }) => wound.severed > 10 && wound.within > 10 && wound.waiting === 0);
-    const { within, severed } = await page.ask(({ wound }) => wound);
-    assert.ok(within <= 2 * severed, `${within} faces of ${severed}`);
+    await page.until(({ wound }) => wound.severed > 10 && wound.cutFaces > 10 && wound.waiting === 0);
+    const { cutFaces, severed } = await page.ask(({ wound }) => wound);
+    assert.ok(cutFaces <= 2 * severed, `${cutFaces} faces of ${severed}`);
     await page.page.keyboard.press("Escape");
     // Pressed beside the cut, one side goes down, and the other shows its face.
     await page.page.check("input[value=tip]", { force: true });
     await page.press(0.5, 0.44);
     await page.until(({ deepestM }) => deepestM > 0.003);
-    await page.picture("within-a-solid");
+    await page.picture("cut-of-solid");
     await page.page.mouse.up();
     assert.deepEqual(page.complaints, []);
     await close(page);

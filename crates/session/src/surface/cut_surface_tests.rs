@@ -58,7 +58,7 @@ fn both_sides_of_a_straight_cut_are_plane_and_have_the_area_of_the_section() {
     assert!(sum_m2 < 2.12 * section_m2, "folded: {sum_m2} m² for two sides of {section_m2}");
     // Both sides are apart everywhere.
     assert!(sides[0].is_disjoint(&sides[1]));
-    assert!(surface.vertices.len() <= model.most_cut_vertices());
+    assert!(surface.vertices.len() <= model.max_cut_vertices());
 }
 
 #[test]

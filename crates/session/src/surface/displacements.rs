@@ -4,7 +4,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use super::refine::{Points, grid};
+use super::refine::{Points, Refinement, grid};
 use super::skin::Skin;
 use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 use palpate_tissue::Cuts;
@@ -29,8 +29,10 @@ pub struct Snapshot {
     /// use.
     skin: Option<Arc<Skin>>,
     shown_m: OnceLock<[Vec<f32>; 3]>,
-    /// The least and the greatest value of each component, m, computed at first use.
-    box_m: OnceLock<[[f32; 2]; 3]>,
+    /// The same with the surface within cuts, for frames that have it.
+    with_cut_surface_m: OnceLock<[Vec<f32>; 3]>,
+    /// The least and the greatest value of each component, m, of frames without and with the surface within cuts, computed at first use.
+    boxes_m: [OnceLock<[[f32; 2]; 3]>; 2],
     /// Number of points along x and y; of a mesh, rows and places per row.
     pub(super) points: [usize; 2],
     /// Distance between points, m; of a mesh, the usual length of an edge.
@@ -51,7 +53,8 @@ impl Snapshot {
             displacement_m,
             skin: None,
             shown_m: OnceLock::new(),
-            box_m: OnceLock::new(),
+            with_cut_surface_m: OnceLock::new(),
+            boxes_m: Default::default(),
             points,
             spacing_m,
         }
@@ -59,12 +62,10 @@ impl Snapshot {
 
     /// Returns this snapshot with the skin of a tissue on a mesh, which must be that of its model. If other vertices
     /// are shown than are simulated, the encoder computes their displacements; otherwise, and with `None`, the skin
-    /// is ignored. With that of a solid, rows for the vertices of the surface within cuts follow those of the surface.
+    /// is ignored.
     #[must_use]
     pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
-        let [rows, columns] = self.points;
-        let points = [rows + skin.map_or(0, |skin| skin.cut_rows()), columns];
-        Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), points, ..self }
+        Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
     }
 
     /// Returns this snapshot with what was severed at its moment.
@@ -78,27 +79,40 @@ impl Snapshot {
         &self.cuts
     }
 
-    /// Returns the displacements of the shown vertices, m.
-    pub(super) fn displacement_m(&self) -> &[Vec<f32>; 3] {
+    /// Returns the displacements of the vertices that frames of `grid` show, m.
+    fn displacement_m(&self, grid: Refinement) -> &[Vec<f32>; 3] {
+        let [rows, columns] = self.points;
         match &self.skin {
             None => &self.displacement_m,
+            Some(skin) if grid.points[0] > rows => self.with_cut_surface_m.get_or_init(|| {
+                skin.displacement_with_cut_surface_m(&self.displacement_m, &self.cuts, grid.points[0] * columns)
+            }),
             Some(skin) => {
-                let [rows, columns] = self.points;
                 self.shown_m.get_or_init(|| skin.displacement_m(&self.displacement_m, &self.cuts, rows * columns))
             }
         }
     }
 
-    /// Returns the bounding box. The thread that encodes computes it once for all encodings, not the stepping
+    /// Returns the bounding box of what frames of `grid` show. The thread that encodes computes it once for all encodings, not the stepping
     /// thread.
-    pub(super) fn box_m(&self) -> &[[f32; 2]; 3] {
-        self.box_m.get_or_init(|| self.displacement_m().each_ref().map(|values| range(values)))
+    pub(super) fn box_m(&self, grid: Refinement) -> &[[f32; 2]; 3] {
+        let with_cut_surface = usize::from(grid.points[0] > self.points[0]);
+        self.boxes_m[with_cut_surface].get_or_init(|| self.displacement_m(grid).each_ref().map(|values| range(values)))
     }
 
-    /// Returns all points.
-    pub(super) fn points(&self) -> Points<'_> {
-        let values = self.displacement_m().each_ref().map(Vec::as_slice);
-        Points { values, stride: self.points[1], count: self.points }
+    /// Returns all points that frames of `grid` show.
+    pub(super) fn points(&self, grid: Refinement) -> Points<'_> {
+        let values = self.displacement_m(grid).each_ref().map(Vec::as_slice);
+        Points { values, stride: self.points[1], count: grid.points }
+    }
+
+    /// Returns the number of rows of frames of `grid` that may differ from 0: rows for the surface within cuts have no vertices at first.
+    pub(super) fn used_rows(&self, grid: Refinement) -> usize {
+        let [rows, _] = self.points;
+        match &self.skin {
+            Some(skin) if grid.points[0] > rows => rows + skin.used_cut_rows(&self.cuts),
+            _ => grid.points[0],
+        }
     }
 }
 

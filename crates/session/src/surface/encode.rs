@@ -204,9 +204,9 @@ pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
 fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     let Snapshot { step, simulation_time_s, topology_version, .. } = *snapshot;
     let mut frame = Frame { step, simulation_time_s, topology_version, ..spent };
-    frame.quanta = Quanta::over(frame.encoding, snapshot.box_m(), 0.0);
+    frame.quanta = Quanta::over(frame.encoding, snapshot.box_m(frame.refinement), 0.0);
     let grid = frame.refinement;
-    let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points()));
+    let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points(grid)));
     fill(width, frame.encoding, &mut frame.patches, &mut rows);
     frame
 }

@@ -74,12 +74,21 @@ impl Refinement {
         }
         let (points, point_spacing_m) = grid(scene);
         let refinement = Refinement { points, point_spacing_m, between: n as usize };
-        let [x, y] = refinement.vertices();
+        refinement.check("refinement", limits)?;
+        Ok(refinement)
+    }
+
+    /// Checks the number of vertices.
+    ///
+    /// # Errors
+    /// Refuses a grid with more than `limits.frame_vertices` vertices ([`Reason::TooLarge`]), in the field `field`.
+    pub fn check(&self, field: &str, limits: &Limits) -> Result<()> {
+        let [x, y] = self.vertices();
         if x * y > limits.frame_vertices {
             let message = format!("makes {x} × {y} vertices, above the limit of {} in all", limits.frame_vertices);
-            return Err(Refusal::new(Reason::TooLarge, "refinement", message));
+            return Err(Refusal::new(Reason::TooLarge, field, message));
         }
-        Ok(refinement)
+        Ok(())
     }
 
     /// Returns this refinement with so many more rows.

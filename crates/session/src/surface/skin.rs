@@ -9,7 +9,7 @@ use palpate_geometry::Group;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::shape::{BoundPlace, CellPlace, PointId, RestShape, ShownShape};
-use palpate_tissue::{CutSurface, Cuts, Model};
+use palpate_tissue::{CutFace, CutSurface, CutVertex, Cuts, Model};
 
 use super::refine::{MESH_ROW, Refinement};
 
@@ -154,12 +154,13 @@ impl Skin {
         self.shape.edge_m()
     }
 
-    /// Returns the memory of the skin's tables, bytes, without the mesh that it shares with the model.
+    /// Returns the memory of the skin's tables, and of the surface within cuts at most, bytes, without the mesh that it shares with the model.
     pub fn bytes(&self) -> u64 {
         let uv = self.uv.as_deref().map_or(0, size_of_val);
         let tables = size_of_val(&*self.vertices) + size_of_val(&*self.places);
         let bound = size_of_val(&*self.bound) + size_of_val(&*self.in_cells);
-        (tables + uv + bound + size_of_val(&*self.rest_m)) as u64
+        let cut_surface = self.model.max_cut_vertices() * size_of::<(CutVertex, [CutFace; 2])>();
+        (tables + uv + bound + size_of_val(&*self.rest_m) + cut_surface) as u64
     }
 
     /// Returns whether the shown vertices differ from the simulated ones.
@@ -172,11 +173,22 @@ impl Skin {
         if self.in_cells.is_empty() || cuts.is_empty() {
             return Arc::default();
         }
-        let mut kept = lock(&self.cut_surface);
-        if !kept.0.is_same(cuts) {
-            *kept = (cuts.clone(), Arc::new(CutSurface::of(&self.model, cuts)));
-        }
-        kept.1.clone()
+        let kept = |kept: &(Cuts, Arc<CutSurface>)| kept.0.is_same(cuts).then(|| kept.1.clone());
+        let known = kept(&*lock(&self.cut_surface));
+        known.unwrap_or_else(|| {
+            // Not under the lock: another reader may be in a hurry.
+            let surface = Arc::new(CutSurface::of(&self.model, cuts));
+            let mut kept = lock(&self.cut_surface);
+            if kept.0.version() <= cuts.version() {
+                *kept = (cuts.clone(), surface.clone());
+            }
+            surface
+        })
+    }
+
+    /// Returns the number of rows of a frame that have vertices of the surface within cuts.
+    pub(super) fn used_cut_rows(&self, cuts: &Cuts) -> usize {
+        self.cut_surface(cuts).vertices.len().div_ceil(MESH_ROW)
     }
 
     /// Returns the place in a frame of the first vertex of the surface within cuts: that of the row after the last vertex.
@@ -192,7 +204,7 @@ impl Skin {
 
     /// Returns the number of rows of a frame for the vertices of the surface within cuts: 0 but for a solid.
     pub fn cut_rows(&self) -> usize {
-        if self.in_cells.is_empty() { 0 } else { self.model.most_cut_vertices().div_ceil(MESH_ROW) }
+        if self.in_cells.is_empty() { 0 } else { self.model.max_cut_vertices().div_ceil(MESH_ROW) }
     }
 
     /// Returns the place in memory of the least corner of the cell that the vertex at each place of a frame moves with; empty but for a
@@ -201,25 +213,28 @@ impl Skin {
         self.in_cells.iter().map(|cell| cell.points[0])
     }
 
+    /// Returns what [`Skin::displacement_m`] does, followed by the displacements of the vertices of the surface within cuts.
+    pub(super) fn displacement_with_cut_surface_m(
+        &self,
+        simulated_m: &[Vec<f32>; 3],
+        cuts: &Cuts,
+        count: usize,
+    ) -> [Vec<f32>; 3] {
+        let mut shown_m = self.displacement_m(simulated_m, cuts, count);
+        for (place, vertex) in (self.first_cut_place()..count).zip(&self.cut_surface(cuts).vertices) {
+            move_with(&vertex.cell, simulated_m, &mut shown_m, place);
+        }
+        shown_m
+    }
+
     /// Returns the displacements of the shown vertices, m, in the order of a frame of `count` places, from those of
     /// the simulated vertices in the order of memory. Vertices in cells that a cut has parted from others move with their own cell.
-    /// Those of the surface within cuts follow, as many as there is room for.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], cuts: &Cuts, count: usize) -> [Vec<f32>; 3] {
         let mut shown_m = [(); 3].map(|()| memory::zeroed::<f32>(count, TABLES));
         for (place, CellPlace { points, weights }) in self.in_cells.iter().enumerate() {
-            let points = &cuts.doubled_corners(points[0]).unwrap_or(*points);
-            for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
-                let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
-                shown_m[place] = points.iter().zip(weights).map(part_m).sum::<f64>() as f32;
-            }
-        }
-        let cut_places = self.first_cut_place()..count;
-        for (place, vertex) in cut_places.zip(&self.cut_surface(cuts).vertices) {
-            for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
-                let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
-                shown_m[place] = vertex.corners.iter().zip(&vertex.weights).map(part_m).sum::<f64>() as f32;
-            }
+            let points = cuts.doubled_corners(points[0]).unwrap_or(*points);
+            move_with(&CellPlace { points, weights: *weights }, simulated_m, &mut shown_m, place);
         }
         for (place, bound) in self.bound.iter().enumerate() {
             let moved_m = bound
@@ -235,6 +250,15 @@ impl Skin {
             }
         }
         shown_m
+    }
+}
+
+/// Sets the displacement of a place of a frame that moves with a cell, m.
+#[allow(clippy::cast_possible_truncation)]
+fn move_with(cell: &CellPlace, simulated_m: &[Vec<f32>; 3], shown_m: &mut [Vec<f32>; 3], place: usize) {
+    for (shown_m, simulated_m) in shown_m.iter_mut().zip(simulated_m) {
+        let part_m = |(point, weight): (&u32, &f64)| weight * f64::from(simulated_m[*point as usize]);
+        shown_m[place] = cell.points.iter().zip(&cell.weights).map(part_m).sum::<f64>() as f32;
     }
 }
 

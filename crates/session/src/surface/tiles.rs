@@ -86,8 +86,8 @@ impl Area {
     }
 
     /// Returns the tile's points within those of a whole sheet.
-    fn of_grid<'v>(&self, snapshot: &'v Snapshot) -> Points<'v> {
-        let Points { values, stride, .. } = snapshot.points();
+    fn of_grid<'v>(&self, snapshot: &'v Snapshot, grid: Refinement) -> Points<'v> {
+        let Points { values, stride, .. } = snapshot.points(grid);
         let from = self.first_point[0] * stride + self.first_point[1];
         Points { values: values.map(|values| &values[from..]), stride, count: self.points }
     }
@@ -99,9 +99,9 @@ fn tiles_along(points: usize) -> usize {
 
 impl Tile {
     /// Returns the displacements from which it was last written.
-    fn shown<'v>(&'v self, key: &'v Snapshot) -> Points<'v> {
+    fn shown<'v>(&'v self, key: &'v Snapshot, grid: Refinement) -> Points<'v> {
         match &self.own {
-            None => self.area.of_grid(key),
+            None => self.area.of_grid(key, grid),
             Some(own) => {
                 let [_, stride] = self.area.points;
                 Points { values: own.each_ref().map(Vec::as_slice), stride, count: self.area.points }
@@ -137,7 +137,7 @@ impl FrameTiles {
             changed: false,
             now: snapshot.clone(),
             joined_since: 0,
-            box_m: *snapshot.box_m(),
+            box_m: *snapshot.box_m(refinement),
             quanta: Quanta::default(),
             tiles: (0..along_x * along_y).map(tile).collect(),
             written: vec![(0, Vec::new()); along_x * along_y],
@@ -180,14 +180,15 @@ impl FrameTiles {
         }
         self.version += 1;
         self.take_moment(snapshot);
-        for (whole, now) in self.box_m.iter_mut().zip(snapshot.box_m()) {
+        for (whole, now) in self.box_m.iter_mut().zip(snapshot.box_m(self.refinement)) {
             *whole = [whole[0].min(now[0]), whole[1].max(now[1])];
         }
         self.fit();
         let unseen_m = self.quanta.unseen_m(self.encoding);
         let width = Width::widest();
         for tile in &mut self.tiles {
-            let (now, shown, mut moved) = (tile.area.of_grid(snapshot), tile.shown(&self.key), false);
+            let (now, shown) = (tile.area.of_grid(snapshot, self.refinement), tile.shown(&self.key, self.refinement));
+            let mut moved = false;
             width.run(Compare { now, shown, unseen_m, moved: &mut moved });
             if moved {
                 tile.take(now, self.version);
@@ -202,7 +203,7 @@ impl FrameTiles {
         self.key = snapshot.clone();
         self.take_moment(snapshot);
         self.changed = false;
-        self.box_m = *snapshot.box_m();
+        self.box_m = *snapshot.box_m(self.refinement);
         self.fit();
         for tile in &mut self.tiles {
             tile.version = self.version;
@@ -225,7 +226,9 @@ impl FrameTiles {
     /// Returns whether any tile was written after version `version`, or the topology has changed since. `None` stands for a viewer
     /// without a frame: then it is true.
     pub fn is_newer_than(&self, version: Option<u64>) -> bool {
-        Some(self.joined_since) > version || self.tiles.iter().any(|tile| Some(tile.version) > version)
+        let used = self.now.used_rows(self.refinement);
+        let is_newer = |tile: &Tile| Some(tile.version) > version && tile.area.first_point[0] < used;
+        Some(self.joined_since) > version || self.tiles.iter().any(is_newer)
     }
 
     /// Returns a frame of the newest snapshot with the tiles that were written after version `version`; all of them
@@ -233,8 +236,10 @@ impl FrameTiles {
     pub fn newer_than(&mut self, version: Option<u64>) -> Frame {
         let FrameTiles { refinement, encoding, version: now_at, quanta, key, now, tiles, written, .. } = self;
         let (width, most) = (Width::widest(), SIDE * (refinement.between + 1) + 1);
-        let mut rows = Rows::new(refinement.between, most, quanta.source(key.points()));
-        let newer = || tiles.iter().zip(0..).filter(|(tile, _)| Some(tile.version) > version);
+        let mut rows = Rows::new(refinement.between, most, quanta.source(key.points(*refinement)));
+        let used = now.used_rows(*refinement);
+        let sent = || tiles.iter().zip(0..).filter(|(tile, _)| tile.area.first_point[0] < used);
+        let newer = || sent().filter(|(tile, _)| Some(tile.version) > version);
         for (tile, number) in newer() {
             let (written_at, patches): &mut (u64, Vec<Patch>) = &mut written[number];
             if *written_at != *now_at || patches.is_empty() {
@@ -242,7 +247,7 @@ impl FrameTiles {
                 if patches.is_empty() {
                     *patches = lay_out(tile.area.first, tile.area.vertices, *encoding);
                 }
-                rows.turn_to(quanta.source(tile.shown(key)));
+                rows.turn_to(quanta.source(tile.shown(key, *refinement)));
                 fill(width, *encoding, patches, &mut rows);
             }
         }
@@ -253,7 +258,7 @@ impl FrameTiles {
             refinement: *refinement,
             encoding: *encoding,
             quanta: *quanta,
-            full: newer().count() == tiles.len(),
+            full: newer().count() == sent().count(),
             patches: newer().flat_map(|(_, number)| written[number].1.iter().cloned()).collect(),
         }
     }

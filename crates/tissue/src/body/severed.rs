@@ -220,11 +220,11 @@ impl Cuts {
 }
 
 impl Model {
-    /// Returns the memory that severed springs of a session may take, bytes: three lists of all springs (its own, the
-    /// guard's checkpoint's, and the one that others read), and their marks. Sheets and surfaces have no more springs
+    /// Returns the memory that severed springs of a session may take, bytes: four lists of all springs (its own, the
+    /// guard's checkpoint's, the one that others read, and the one whose surface was shown last), and their marks. Sheets and surfaces have no more springs
     /// to sever; in a solid the doubled corners come from the spare places of a state.
     pub fn cut_bytes(&self) -> u64 {
-        const LISTS: u64 = 3;
+        const LISTS: u64 = 4;
         LISTS * (self.end_count() as u64 / 2) * size_of::<SeveredSpring>() as u64 + self.end_count() as u64 / 8
     }
 }

@@ -51,7 +51,7 @@ pub use named::Named;
 use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{Shown, Simulated};
-pub(crate) use solid::CORNERS;
+pub(crate) use solid::trilinear;
 pub use solid::{Branch, Branches, CellSize, FixedPart, Gravity, Layer, Solid, SolidMaterial, SolidShape};
 use source::Files;
 pub use springs::{MAX_PRESTRAIN, Springs};

@@ -34,8 +34,8 @@ pub use fixed::FixedPart;
 use foundation::Foundation;
 pub use gravity::Gravity;
 pub use layer::Layer;
-pub(crate) use shape::CORNERS;
 use shape::places_in_cube;
+pub(crate) use shape::trilinear;
 pub use shape::{CellSize, SolidShape};
 use slowest::SlowestVibration;
 

@@ -44,14 +44,14 @@ impl Tool {
         let place_m = self.place_m(fraction);
         let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
         let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
-        if model.scene.cutting.resistance_n(length_m) <= 0.0 {
-            // Nothing is felt, wherever the edge pierces the surface.
-            self.contact_state = ContactState::Free;
-            self.resistance_n = 0.0;
-            return ContactForce::default();
-        }
         if self.contact_state == ContactState::Free && plan.is_first(fraction) {
-            self.seek_pierced(model, layout, state, [place_m, edge_m]);
+            if model.scene.cutting.resistance_n(length_m) > 0.0 {
+                self.seek_pierced(model, layout, state, [place_m, edge_m]);
+            } else {
+                // Nothing is felt, so the place only follows the edge: once a step is enough.
+                let sought_m = place_m + self.pierced_m.clamp(0.0, length_m) * edge;
+                self.footprint.seek(model, sought_m, true, |point| displacement_m(model, layout, state, point));
+            }
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         self.normal = self.footprint.outward(&along);

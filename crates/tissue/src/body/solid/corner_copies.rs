@@ -144,6 +144,12 @@ impl CornerCopies {
         self.copies.get(copy).map(|copy| copy.version)
     }
 
+    /// Returns the place of the corner or copy from which a copy came; `None` for a corner.
+    pub(crate) fn origin_of(&self, place: usize) -> Option<u32> {
+        let copy = place.checked_sub(self.first_spare as usize)?;
+        self.copies.get(copy).map(|copy| copy.from)
+    }
+
     /// Returns the version of the topology since which two cubes, given by their least corners, no longer share a corner that they have in
     /// common; `None` if they share all.
     pub(crate) fn apart_since(&self, places: &SolidPlaces, cubes: [usize; 2]) -> Option<u32> {

@@ -17,18 +17,17 @@ use crate::body::model::Model;
 use crate::body::severed::Cuts;
 use crate::body::solid::corner_copies::{CornerCopies, corners_of};
 use crate::body::solid::places::SolidPlaces;
-use crate::scene::CORNERS;
+use crate::scene::trilinear;
+use crate::shape::CellPlace;
 
 /// A vertex of the surface within a cut.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CutVertex {
     /// Its rest position, m, in the tissue's frame.
     pub rest_m: DVec3,
-    /// The corners of the cell that it moves with, by their places in
-    /// [`Tissue::shown_displacements_m`](crate::Tissue::shown_displacements_m), x before y before z.
-    pub corners: [u32; 8],
-    /// Their trilinear weights, with the sum 1. The vertex may be outside the cell: then some are negative.
-    pub weights: [f64; 8],
+    /// The cell that it moves with, the points by their places in
+    /// [`Tissue::shown_displacements_m`](crate::Tissue::shown_displacements_m). The vertex may be outside it: then some weights are negative.
+    pub cell: CellPlace,
     /// The version of the topology since which it has this rest position.
     pub version: u32,
 }
@@ -49,13 +48,13 @@ pub struct CutFace {
 pub struct CutSurface {
     /// The vertices, in the order of the versions in which they appeared.
     pub vertices: Vec<CutVertex>,
-    /// The faces, ascending by number; those outside the tissue are left out.
+    /// The faces, ascending by number; those outside the tissue, and those for which there are too many vertices, are left out.
     pub faces: Vec<CutFace>,
 }
 
 impl Model {
     /// Returns the largest number of vertices of a [`CutSurface`]: two for each spare place of a solid, 0 for other tissues.
-    pub fn most_cut_vertices(&self) -> usize {
+    pub fn max_cut_vertices(&self) -> usize {
         self.places.solid().map_or(0, |places| VERTICES_PER_SPARE * places.spare().len())
     }
 }
@@ -87,13 +86,13 @@ struct Crossings {
 
 /// How much a plane through crossings resists a slope, by the mean square of their distances, in edges: crossings in a row say nothing
 /// about the slope across it.
-const STIFF: f64 = 1e-4;
+const PLANE_REGULARISATION: f64 = 1e-4;
 
 /// Crossings whose spreads along two axes have a smaller product, in edges⁴, are about in a row: faces of two rows have 1/16 or more.
 const MIN_SPREAD: f64 = 0.03;
 
 /// How often a vertex outside the tissue is moved to the nearest place of its surface and back to the plane.
-const TURNS: usize = 4;
+const MAX_TURNS: usize = 4;
 
 impl Crossings {
     fn none(version: u32) -> Self {
@@ -134,41 +133,34 @@ impl Crossings {
         self.spread(b, b) * self.spread(c, c) - self.spread(b, c).powi(2) > MIN_SPREAD
     }
 
-    /// Returns the place of the vertex of a corner, m, and whether it was outside the tissue: then it is moved to the surface, within the
-    /// plane as nearly as a few turns allow.
-    fn vertex_m(&self, places: &SolidPlaces, corner: usize) -> (DVec3, bool) {
-        let mut at_m = places.at_m(self.moved(places.coordinates(corner)));
+    /// Returns the place of the vertex of a corner, m. Outside the tissue it is moved to the surface, within the plane as nearly as a few
+    /// turns allow.
+    fn vertex_m(&self, places: &SolidPlaces, corner: usize) -> DVec3 {
+        let coordinates = places.coordinates(corner);
+        let mut at_m = places.at_m(self.moved(coordinates, coordinates));
         // It is no farther from the corner than the cubes around it reach.
-        let around = [0, 1].into_iter().flat_map(|beside| places.cubes_around(corner, beside));
-        if around.flatten().filter(|cube| places.cube_mass(*cube) >= 1.0).count() == 8 {
-            return (at_m, false);
+        if is_within_cubes(places, corner) {
+            return at_m;
         }
-        let surface = places.shown_surface();
-        let mut was_outside = false;
-        for _ in 0..TURNS {
-            let Some(place) = surface.nearest(at_m) else { break };
-            let nearest_m = surface.at_m(&place);
-            let [along, across] = place.frame;
-            if along.cross(across).dot(at_m - nearest_m) <= 0.0 {
-                break;
-            }
-            was_outside = true;
-            at_m = places.at_m(self.moved(places.coordinates_at(nearest_m)));
+        for _ in 0..MAX_TURNS {
+            let Some(surface_m) = surface_below_m(places, at_m) else { break };
+            at_m = places.at_m(self.moved(places.coordinates_at(surface_m), coordinates));
         }
-        (at_m, was_outside)
+        at_m
     }
 
-    /// Returns where a place is moved to along one axis: onto the plane that fits the crossings best, by at most an edge.
-    fn moved(&self, corner: DVec3) -> DVec3 {
+    /// Returns where a place near a corner is moved to along one axis: onto the plane that fits the crossings best, at most an edge from the corner.
+    fn moved(&self, place: DVec3, corner: DVec3) -> DVec3 {
         let (axis, mean) = self.middle();
         let [b, c] = [(axis + 1) % 3, (axis + 2) % 3];
         let spread = |p: usize, q: usize| self.spread(p, q);
-        let [own_b, own_c, mixed] = [spread(b, b) + STIFF, spread(c, c) + STIFF, spread(b, c)];
+        let [own_b, own_c, mixed] =
+            [spread(b, b) + PLANE_REGULARISATION, spread(c, c) + PLANE_REGULARISATION, spread(b, c)];
         let area = own_b * own_c - mixed * mixed;
         let slope_b = (own_c * spread(axis, b) - mixed * spread(axis, c)) / area;
         let slope_c = (own_b * spread(axis, c) - mixed * spread(axis, b)) / area;
-        let at = mean[axis] + slope_b * (corner[b] - mean[b]) + slope_c * (corner[c] - mean[c]);
-        let mut moved = corner;
+        let at = mean[axis] + slope_b * (place[b] - mean[b]) + slope_c * (place[c] - mean[c]);
+        let mut moved = place;
         moved[axis] = at.clamp(corner[axis] - 1.0, corner[axis] + 1.0);
         moved
     }
@@ -228,22 +220,28 @@ impl CutSurface {
             }
         }
         let rest_m = |(corner, crossings): (&u32, &Crossings)| (*corner, crossings.vertex_m(places, *corner as usize));
-        let rest_m: BTreeMap<u32, (DVec3, bool)> = around.iter().map(rest_m).collect();
-        let most = model.most_cut_vertices();
-        let vertices = uses.iter().take(most).map(|([since, _], (corner, cube))| CutVertex {
+        let rest_m: BTreeMap<u32, DVec3> = around.iter().map(rest_m).collect();
+        let max = model.max_cut_vertices();
+        let vertices = uses.iter().take(max).map(|([since, _], (corner, cube))| CutVertex {
             version: (*since).max(around[corner].versions[1]),
-            ..vertex_in(places, copies, *cube as usize, rest_m[corner].0)
+            ..vertex_in(places, copies, *cube as usize, rest_m[corner])
         });
         let vertices = vertices.collect();
         let number_of: BTreeMap<u32, (u32, u32)> =
-            uses.keys().take(most).zip(0..).map(|([since, place], number)| (*place, (number, *since))).collect();
+            uses.keys().take(max).zip(0..).map(|([since, place], number)| (*place, (number, *since))).collect();
         let mut shown = Vec::new();
         for (face, number) in faces.iter().zip(0..) {
-            if face.corners.iter().all(|corner| rest_m[corner].1) {
+            // By what does not change with further cuts: a client keeps the faces that it was sent.
+            if face.corners.iter().all(|corner| is_outside(places, *corner as usize)) {
                 continue;
             }
             for side in 0..2_u32 {
-                let found = face.places[side as usize].map(|place| number_of.get(&place));
+                // Beyond the last number, a copy is shown with what it came from: together.
+                let numbered = |place: u32| {
+                    let origins = std::iter::successors(Some(place), |place| copies.origin_of(*place as usize));
+                    origins.into_iter().find_map(|place| number_of.get(&place))
+                };
+                let found = face.places[side as usize].map(numbered);
                 let [Some(a), Some(b), Some(c), Some(d)] = found else { continue };
                 let version = [a.1, b.1, c.1, d.1].into_iter().fold(face.version, u32::max);
                 // Seen from within the cut, from the other cube.
@@ -287,12 +285,34 @@ impl SeveredFace {
     }
 }
 
+/// Returns whether all cubes around a corner are there, and wholly inside the tissue.
+fn is_within_cubes(places: &SolidPlaces, corner: usize) -> bool {
+    let around = [0, 1].into_iter().flat_map(|beside| places.cubes_around(corner, beside));
+    around.flatten().filter(|cube| places.cube_mass(*cube) >= 1.0).count() == 8
+}
+
+/// Returns the nearest place of the surface, m, for a place outside the tissue.
+fn surface_below_m(places: &SolidPlaces, at_m: DVec3) -> Option<DVec3> {
+    let surface = places.shown_surface();
+    let place = surface.nearest(at_m)?;
+    let nearest_m = surface.at_m(&place);
+    let [along, across] = place.frame;
+    (along.cross(across).dot(at_m - nearest_m) > 0.0).then_some(nearest_m)
+}
+
+/// Returns whether a corner of the lattice is outside the tissue.
+fn is_outside(places: &SolidPlaces, corner: usize) -> bool {
+    !is_within_cubes(places, corner) && surface_below_m(places, places.rest_m(corner)).is_some()
+}
+
+/// How far outside its cube a vertex counts as, in edges: farther out, a sheared cube would throw it away.
+const MAX_OUTSIDE: f64 = 0.5;
+
 /// Returns a vertex at a rest position, m, that moves with a cube.
 #[allow(clippy::cast_possible_truncation)]
 fn vertex_in(places: &SolidPlaces, copies: &CornerCopies, cube: usize, rest_m: DVec3) -> CutVertex {
-    let part = (rest_m - places.rest_m(cube)) / places.edge_m();
-    let weight =
-        |by: [usize; 3]| (0..3).map(|axis| if by[axis] == 1 { part[axis] } else { 1.0 - part[axis] }).product();
-    let corners = corners_of(places, Some(copies), cube).map(|place| place as u32);
-    CutVertex { rest_m, corners, weights: CORNERS.map(weight), version: 0 }
+    let part = ((rest_m - places.rest_m(cube)) / places.edge_m())
+        .clamp(DVec3::splat(-MAX_OUTSIDE), DVec3::splat(1.0 + MAX_OUTSIDE));
+    let points = corners_of(places, Some(copies), cube).map(|place| place as u32);
+    CutVertex { rest_m, cell: CellPlace { points, weights: trilinear(part) }, version: 0 }
 }

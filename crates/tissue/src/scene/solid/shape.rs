@@ -86,6 +86,11 @@ pub struct SolidShape {
 pub(crate) const CORNERS: [[usize; 3]; 8] =
     [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
 
+/// Returns the trilinear weights of the corners of a cube for a place whose coordinates are 0 to 1 within it.
+pub(crate) fn trilinear(part: DVec3) -> [f64; 8] {
+    CORNERS.map(|by| (0..3).map(|axis| if by[axis] == 1 { part[axis] } else { 1.0 - part[axis] }).product())
+}
+
 impl SolidShape {
     /// Fills a closed surface with cubes, and finds the fixed points.
     ///
@@ -412,8 +417,7 @@ impl SolidShape {
         let part = [0, 1, 2].map(|axis| (at[axis] - cell[axis] as f64).clamp(0.0, 1.0));
         CellPlace {
             points: CORNERS.map(|by| self.point_of[self.corner(added(cell, by))]),
-            weights: CORNERS
-                .map(|by| (0..3).map(|axis| if by[axis] == 1 { part[axis] } else { 1.0 - part[axis] }).product()),
+            weights: trilinear(part.into()),
         }
     }
 

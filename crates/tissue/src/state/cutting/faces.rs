@@ -25,6 +25,9 @@ const REACH: f64 = 2.0;
 /// How much farther a cube's middle may be than its least corner shows, in edges.
 const SLACK: f64 = 0.75;
 
+/// How much farther the rows and columns are looked for in which cubes may be near, in edges.
+const ROUNDING: f64 = 1e-6;
+
 /// The axes.
 const AXES: usize = 3;
 
@@ -94,9 +97,10 @@ impl<T: Real> TissueState<T> {
         let near_tiles = search.near(model, layout, state, &tiles.moved, [least_m - reach_m, most_m + reach_m]);
         for NearTile { tile, displaced } in near_tiles {
             let [rows, columns] = sides_of(layout, tile);
-            // Where a cube's least corner is at rest if it is near.
-            let from_m = least_m - reach_m - model.unit_m * displaced[1];
-            let to_m = most_m + reach_m - model.unit_m * displaced[0];
+            // Where a cube's least corner is at rest if it is near, with room for rounding.
+            let slack_m = reach_m + ROUNDING * model.unit_m;
+            let from_m = least_m - slack_m - model.unit_m * displaced[1];
+            let to_m = most_m + slack_m - model.unit_m * displaced[0];
             for row in rows {
                 // Without the divisions that find one cube's place.
                 let (first_m, from) = (model.end_at_rest_m(row * layout.columns), row * layout.stride);
