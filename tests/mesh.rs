@@ -375,6 +375,7 @@ const MATERIAL: Material = Material {
     depth_m: 0.03,
     foundation_n_per_m3: 4e5,
     damping_ratio: 0.5,
+    foundation_group: None,
 };
 
 #[test]

@@ -4243,7 +4243,7 @@ impl ::prost::Name for FixedPlane {
 /// client sends none of these: `mesh.point_mass_kg`, `anchor_springs`, `damping`, the k of `springs`. A server sends
 /// them, including changes by UpdateTissue: k of an edge between triangles with equal sides; mass, K″ and C of a
 /// vertex of mean area.
-#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Material {
     /// E, Young's modulus of the capsule, Pa; above 0. Its Poisson's ratio is 1/3. Required.
     #[prost(double, optional, tag = "1")]
@@ -4263,6 +4263,9 @@ pub struct Material {
     /// ζ, damping ratio of a point on its anchor spring; 0 to 100. 0.5 if absent.
     #[prost(double, optional, tag = "6")]
     pub damping_ratio: ::core::option::Option<f64>,
+    /// The name of a group of the mesh: only its vertices lie on the foundation. Absent: all.
+    #[prost(string, optional, tag = "7")]
+    pub foundation_group: ::core::option::Option<::prost::alloc::string::String>,
 }
 impl ::prost::Name for Material {
     const NAME: &'static str = "Material";
@@ -4336,7 +4339,7 @@ impl ::prost::Name for Springs {
         "/palpate.v1.Springs".into()
     }
 }
-/// How a tissue is cut: how it resists a blade, and when it tears.
+/// How a tissue is cut: how it resists a blade, when it tears, and where its anchor springs end.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Cutting {
     /// Fracture toughness: the work of a cut for each unit of its area, J/m²; 0 or more. 0: a blade feels nothing.
@@ -4352,6 +4355,14 @@ pub struct Cutting {
     /// tear at the same strain.
     #[prost(double, optional, tag = "4")]
     pub tear_reference_m: ::core::option::Option<f64>,
+    /// On a mesh: length of the anchor springs, m; above 0. So far beneath each point its anchor is attached, and a blade that crosses the
+    /// line between both severs the anchor. Absent: nothing severs anchors.
+    #[prost(double, optional, tag = "5")]
+    pub anchor_depth_m: ::core::option::Option<f64>,
+    /// The direction from the points to where their anchors are attached, of any length above 0. Absent: into the tissue, against the
+    /// normal of each point. With `anchor_depth_m` only.
+    #[prost(message, optional, tag = "6")]
+    pub anchor_direction: ::core::option::Option<Vector3>,
 }
 impl ::prost::Name for Cutting {
     const NAME: &'static str = "Cutting";
@@ -4902,7 +4913,7 @@ pub struct Session {
     /// The version of what joins the points of the tissue (ViewService.GetTopology): 0 if nothing was severed.
     #[prost(uint32, tag = "36")]
     pub topology_version: u32,
-    /// Number of severed springs.
+    /// Number of severed springs, anchor springs included.
     #[prost(uint32, tag = "37")]
     pub severed: u32,
     /// Number of parts of the tissue; 1 if it is whole.
@@ -4921,6 +4932,9 @@ pub struct Session {
     /// follows from it are those of the tissue without what is hidden.
     #[prost(message, optional, tag = "42")]
     pub exercise: ::core::option::Option<SessionExercise>,
+    /// How many of the severed springs are anchor springs (Cutting.anchor_depth_m).
+    #[prost(uint32, tag = "43")]
+    pub severed_anchors: u32,
 }
 impl ::prost::Name for Session {
     const NAME: &'static str = "Session";
@@ -7719,7 +7733,7 @@ pub struct GetWoundResponse {
     pub vertices: ::prost::alloc::vec::Vec<LipVertex>,
     #[prost(message, repeated, tag = "5")]
     pub triangles: ::prost::alloc::vec::Vec<CutTriangles>,
-    /// Number of severed springs.
+    /// Number of severed springs, anchor springs included.
     #[prost(uint32, tag = "6")]
     pub severed: u32,
     /// Number of parts of the tissue; 1 if it is whole.

@@ -137,8 +137,9 @@ fn tell(arguments: &RunArguments, summary: &Summary) {
             ("final hash", summary.final_hash.clone()),
         ];
         let cuts = summary.topology.filter(|topology| topology.severed > 0).map(|topology| {
-            let TopologyRecord { severed, pieces, fracture_j, .. } = topology;
-            ("severed", format!("{severed}, pieces: {pieces}, fracture: {fracture_j:.3e} J"))
+            let TopologyRecord { severed, severed_anchors, pieces, fracture_j, .. } = topology;
+            let anchors = if severed_anchors > 0 { format!(", anchors: {severed_anchors}") } else { String::new() };
+            ("severed", format!("{severed}{anchors}, pieces: {pieces}, fracture: {fracture_j:.3e} J"))
         });
         text.extend(rows.into_iter().chain(cuts).map(|(name, value)| format!("{name:<28}{value}\n")));
         let all_s: f64 = summary.stages.iter().map(|stage| stage.time_s).sum();

@@ -56,6 +56,7 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
         }),
         topology_version: status.cuts.version(),
         severed: count(status.cuts.len()),
+        severed_anchors: count(status.cuts.anchor_count()),
         fracture_j: status.cuts.fracture_j(),
         // Counting looks at all springs.
         pieces: if status.cuts.is_empty() { 1 } else { count(status.cuts.pieces(model)) },
@@ -99,6 +100,7 @@ pub(super) fn of_trainee(handle: &SessionHandle, exercise: &LiveExercise) -> pb:
         commands: of_trainer.commands,
         topology_version: of_trainer.topology_version,
         severed: of_trainer.severed,
+        severed_anchors: of_trainer.severed_anchors,
         pieces: of_trainer.pieces,
         cuts_exhausted: of_trainer.cuts_exhausted,
         ties: of_trainer.ties,

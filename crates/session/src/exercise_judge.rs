@@ -29,6 +29,8 @@ pub struct ExerciseJudge {
     newest: u64,
     /// Number of severed springs, and the numbers of threads and clips, that were there at the beginning.
     severed_before: usize,
+    /// How many of those springs are between points.
+    joints_before: usize,
     ties_before: Vec<usize>,
     /// Whether the trainee has done anything: touched the tissue, cut it, or marked a place.
     has_acted: bool,
@@ -76,6 +78,7 @@ impl ExerciseJudge {
             begin_step,
             newest: begin_step,
             severed_before: 0,
+            joints_before: 0,
             ties_before: Vec::new(),
             has_acted: false,
             marks_before: 0,
@@ -90,6 +93,7 @@ impl ExerciseJudge {
         let step = session.step_count();
         if step == self.begin_step {
             self.severed_before = session.tissue().cuts().len();
+            self.joints_before = session.tissue().cuts().joint_count();
             self.marks_before = session.marks().len();
             self.ties_before = session.tissue().ties().iter().map(|tie| tie.number).collect();
         }
@@ -193,7 +197,7 @@ impl ExerciseJudge {
             rules,
             answers: self.answers(session).iter().map(answer).collect(),
             lines: self.exercise.lines.iter().map(line).collect(),
-            severed: severed(session, self.severed_before),
+            severed: severed(session, self.joints_before),
             stitches_m: session.tissue().ties().iter().filter(holds).map(bites_m).collect(),
         }
     }

@@ -359,6 +359,7 @@ pub fn topology(tissue: &dyn Tissue) -> TopologyRecord {
     TopologyRecord {
         topology_version: cuts.version(),
         severed: cuts.len(),
+        severed_anchors: cuts.anchor_count(),
         pieces: cuts.pieces(tissue.model()),
         fracture_j: cuts.fracture_j(),
     }

@@ -70,8 +70,16 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
 
 /// Returns how a tissue is cut.
 fn from_cutting(message: pb::Cutting) -> Cutting {
-    let pb::Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m } = message;
-    Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m }
+    let pb::Cutting {
+        toughness_j_per_m2,
+        thickness_m,
+        tear_strain,
+        tear_reference_m,
+        anchor_depth_m,
+        anchor_direction,
+    } = message;
+    let anchor_direction = anchor_direction.map(|direction| from_vector(Some(&direction)));
+    Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m, anchor_depth_m, anchor_direction }
 }
 
 /// Returns a tissue whose coefficients the message gives.
@@ -132,7 +140,7 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
     let bending = springs.bending_factor.unwrap_or(if springs.bending { 1.0 } else { 0.0 });
     let bending = number("springs.bending_factor", bending, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     // A material determines the mass of a point later.
-    let point_mass_kg = required("mesh.point_mass_kg", of_mesh.point_mass_kg.or(material.map(|_| 1.0)))?;
+    let point_mass_kg = required("mesh.point_mass_kg", of_mesh.point_mass_kg.or(material.as_ref().map(|_| 1.0)))?;
     let vertices = of_mesh.vertices.map(|vertices| vertices as usize);
     if let Some(vertices) = vertices {
         #[allow(clippy::cast_precision_loss)]
@@ -252,6 +260,7 @@ fn from_material(message: &pb::Material) -> Result<Material> {
         density_kg_per_m3: message.density_kg_per_m3.unwrap_or(usual.density_kg_per_m3),
         depth_m: message.depth_m.unwrap_or(usual.depth_m),
         damping_ratio: message.damping_ratio.unwrap_or(usual.damping_ratio),
+        foundation_group: message.foundation_group.clone(),
         ..usual
     })
 }
@@ -465,6 +474,8 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             thickness_m: scene.cutting.thickness_m,
             tear_strain: scene.cutting.tear_strain,
             tear_reference_m: scene.cutting.tear_reference_m,
+            anchor_depth_m: scene.cutting.anchor_depth_m,
+            anchor_direction: scene.cutting.anchor_direction.and_then(vector),
         }),
     }
 }
@@ -536,6 +547,7 @@ fn material(material: &Material) -> pb::Material {
         depth_m: Some(material.depth_m),
         foundation_n_per_m3: Some(material.foundation_n_per_m3),
         damping_ratio: Some(material.damping_ratio),
+        foundation_group: material.foundation_group.clone(),
     }
 }
 
@@ -791,6 +803,23 @@ mod tests {
             assert_eq!((refused.field.as_str(), refused.reason), (field, reason), "{refused}");
             assert!(refused.message.contains(words), "{refused}");
         }
+    }
+
+    #[test]
+    fn anchors_that_a_blade_severs_come_back_as_they_went() {
+        let mut message = of_a_material();
+        material_of(&mut message).foundation_group = Some("lump".to_owned());
+        message.cutting = Some(pb::Cutting {
+            anchor_depth_m: Some(0.003),
+            anchor_direction: vector(DVec3::new(0.0, -1.0, 2.0)),
+            ..Default::default()
+        });
+        let read = |message: &pb::Scene| from_scene(message, Some(&tetrahedron())).unwrap();
+        let made = read(&message);
+        let told = scene(&made);
+        assert_eq!((told.cutting, made.cutting.anchor_depth_m), (message.cutting, Some(0.003)));
+        assert_eq!(told.material.unwrap().foundation_group.as_deref(), Some("lump"));
+        assert_eq!(made.mesh().unwrap().differences.extra_anchor[0], -1.0);
     }
 
     fn paper() -> Scene {

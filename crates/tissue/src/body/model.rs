@@ -311,16 +311,13 @@ impl Model {
         self.scene.anchor_stiffness_n_per_m * self.relative_anchor_stiffness_at(index) + by_foundation
     }
 
-    /// Returns the force of the springs on a point of a relative mass along an axis, N, from the gathered value of the tables in their
-    /// unit ([`Plan::spring_unit`]) and the displacement in spacings.
-    pub(crate) fn spring_force_n(&self, [spring_unit, mass]: [f64; 2], index: usize, gathered: f64, u: f64) -> f64 {
-        let force_n = gathered / spring_unit;
-        if !self.places.differ() {
-            return force_n;
-        }
-        // Anchor stiffness beyond the reference K″ is not part of the springs.
-        let pulled_n = self.scene.anchor_stiffness_n_per_m * self.extra_anchor_at(index) * u * self.unit_m;
-        mass * (force_n + pulled_n)
+    /// Returns whether the point at a place in memory has an anchor spring that may be severed. (A change of the tissue may have set all K″
+    /// to 0.)
+    pub(crate) fn has_severable_anchor(&self, index: usize) -> bool {
+        let is_anchored = self.relative_anchor_stiffness_at(index) > 0.0;
+        let is_point = self.places.joined(index).next().is_some();
+        let is_free = self.fixed.binary_search(&index).is_err();
+        self.scene.cutting.anchor_depth_m.is_some() && is_point && is_anchored && is_free
     }
 
     /// Returns the number of places that a substep computes with all points awake: rows times columns in

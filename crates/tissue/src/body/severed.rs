@@ -2,7 +2,8 @@
 //!
 //! A spring is known by its first end (the one with the lower place in memory) and by its number among the springs of that
 //! end ([`Model::springs_at`]). In a solid, the face between two cubes stands for a spring between their middles, whose ends are
-//! at the cubes' least corners; what follows from severed faces is in `solid::corner_copies`. Each change of the set has a version, which only grows: also if the guard goes back to a
+//! at the cubes' least corners; what follows from severed faces is in `solid::corner_copies`. An anchor spring of a surface
+//! has one end in the tissue, which stands for both, and a number of its own ([`ANCHOR`]). Each change of the set has a version, which only grows: also if the guard goes back to a
 //! checkpoint and so undoes a cut.
 
 use std::ops::Deref;
@@ -12,6 +13,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::Model;
 use crate::body::solid::corner_copies::{CornerCopies, DoubledCorner};
+use crate::body::surface::NO_ANCHOR;
 use crate::saved::{SavedSpring, ensure, unsound};
 use crate::shape::PointId;
 use palpate_refusal::Result;
@@ -19,12 +21,15 @@ use palpate_refusal::Result;
 /// Versions in a snapshot are below this, so that counting on does not overflow.
 const MAX_VERSION: u32 = u32::MAX / 2;
 
+/// The number of the anchor spring of a point, beside those of its other springs.
+pub(crate) const ANCHOR: u32 = u32::MAX;
+
 /// A severed spring.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SeveredSpring {
-    /// The places of its ends, ascending.
+    /// The places of its ends, ascending; of an anchor spring, that of its point twice.
     pub(crate) ends: [u32; 2],
-    /// Its number among the springs of the first end.
+    /// Its number among the springs of the first end, or [`ANCHOR`].
     pub(crate) number: u32,
     /// Where it was severed: the part of the way from the first end to the second, 0 to 1.
     pub(crate) part: f64,
@@ -36,6 +41,8 @@ pub(crate) struct SeveredSpring {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Cuts {
     springs: Arc<Vec<SeveredSpring>>,
+    /// How many of them are anchor springs.
+    anchors: usize,
     version: u32,
     /// The version since which springs were severed only, and none became whole again.
     grows_since: u32,
@@ -74,9 +81,19 @@ impl Cuts {
         self.version == other.version && Arc::ptr_eq(&self.springs, &other.springs)
     }
 
-    /// Returns the number of severed springs.
+    /// Returns the number of severed springs, anchor springs included.
     pub fn len(&self) -> usize {
         self.springs.len()
+    }
+
+    /// Returns the number of severed anchor springs.
+    pub fn anchor_count(&self) -> usize {
+        self.anchors
+    }
+
+    /// Returns the number of severed springs between points, those of [`Cuts::joints`].
+    pub fn joint_count(&self) -> usize {
+        self.springs.len() - self.anchors
     }
 
     /// Returns the energy that has gone into separation, J: the work of blades at their edges, Gc for each unit of area that they cut,
@@ -90,14 +107,15 @@ impl Cuts {
         self.springs.is_empty()
     }
 
-    /// Returns the severed springs by their points, in the order in which they were severed. `model` is that of the tissue.
+    /// Returns the severed springs between points, in the order in which they were severed: all but anchor springs. `model` is that of the
+    /// tissue.
     pub fn joints(&self, model: &Model) -> Vec<SeveredJoint> {
         let of = |spring: &SeveredSpring| SeveredJoint {
             points: spring.ends.map(|place| model.point_at(place as usize)),
             part: spring.part,
             version: spring.version,
         };
-        self.springs.iter().map(of).collect()
+        self.springs.iter().filter(|spring| !spring.is_anchor()).map(of).collect()
     }
 
     /// Returns the number of parts into which the severed springs divide the tissue: 1 for one that is whole. Points that the model
@@ -207,11 +225,17 @@ impl Cuts {
             ensure((last..=version).contains(&since), "a severed spring of another version of the topology")?;
             ensure((0.0..=1.0).contains(&part), "a spring severed beyond its ends")?;
             ensure((place as usize) < model.place_count(), "a severed spring at a place that the tissue lacks")?;
-            let found = model.springs_at(place as usize).into_iter().find(|spring| spring.number == number as usize);
-            let other = found.map(|spring| spring.other).filter(|other| *other > place as usize);
-            let other = other.and_then(|other| u32::try_from(other).ok());
-            let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
-            let spring = SeveredSpring { ends: [place, other], number, part, version: since };
+            let spring = if number == ANCHOR {
+                ensure(model.has_severable_anchor(place as usize), "a severed anchor spring that the tissue lacks")?;
+                SeveredSpring::anchor(place as usize, part, since)
+            } else {
+                let found =
+                    model.springs_at(place as usize).into_iter().find(|spring| spring.number == number as usize);
+                let other = found.map(|spring| spring.other).filter(|other| *other > place as usize);
+                let other = other.and_then(|other| u32::try_from(other).ok());
+                let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
+                SeveredSpring { ends: [place, other], number, part, version: since }
+            };
             ensure(severed.has_room(model), "more severed springs than the tissue has room for")?;
             ensure(severed.add(model, spring).is_some(), "a spring that is severed twice")?;
         }
@@ -225,7 +249,9 @@ impl Model {
     /// to sever; in a solid the doubled corners come from the spare places of a state.
     pub fn cut_bytes(&self) -> u64 {
         const LISTS: u64 = 4;
-        LISTS * (self.end_count() as u64 / 2) * size_of::<SeveredSpring>() as u64 + self.end_count() as u64 / 8
+        let anchors = if self.scene.cutting.anchor_depth_m.is_some() { self.place_count() as u64 } else { 0 };
+        let (springs, ends) = (self.end_count() as u64 / 2 + anchors, self.end_count() as u64 + anchors);
+        LISTS * springs * size_of::<SeveredSpring>() as u64 + ends / 8
     }
 }
 
@@ -235,6 +261,8 @@ pub(crate) struct Severed {
     cuts: Cuts,
     /// A bit for each spring at each of its ends; empty if nothing is severed.
     ends: Vec<u64>,
+    /// A bit for the anchor spring of each place; empty if none is severed.
+    anchors: Vec<u64>,
 }
 
 impl Deref for Severed {
@@ -264,13 +292,30 @@ impl Severed {
         self.ends.get(end / 64).is_some_and(|bits| bits >> (end % 64) & 1 != 0)
     }
 
+    /// Returns whether the anchor spring of the point at a place in memory is severed.
+    #[inline(always)]
+    pub(crate) fn has_anchor(&self, place: usize) -> bool {
+        self.anchors.get(place / 64).is_some_and(|bits| bits >> (place % 64) & 1 != 0)
+    }
+
+    /// Returns K″/m at a place in memory divided by the reference value, minus 1, from that of the model.
+    #[inline(always)]
+    pub(crate) fn extra_anchor(&self, of_model: f64, place: usize) -> f64 {
+        if self.has_anchor(place) { NO_ANCHOR } else { of_model }
+    }
+
+    /// Returns whether a spring is severed.
+    fn has_spring(&self, model: &Model, spring: &SeveredSpring) -> bool {
+        if spring.is_anchor() { self.has_anchor(spring.ends[0] as usize) } else { self.has(spring.ends_of(model)[0]) }
+    }
+
     /// Adds a spring. Returns the corners that this doubles, if the spring was whole.
     pub(crate) fn add(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<DoubledCorner>> {
-        let [end, _] = spring.ends_of(model);
-        if self.has(end) {
+        if self.has_spring(model, &spring) {
             return None;
         }
         self.mark(model, &spring, true);
+        self.cuts.anchors += usize::from(spring.is_anchor());
         Arc::make_mut(&mut self.cuts.springs).push(spring);
         Some(self.double(model, &spring))
     }
@@ -313,23 +358,42 @@ impl Severed {
 
     /// Sets the bits of a spring.
     fn mark(&mut self, model: &Model, spring: &SeveredSpring, is_severed: bool) {
-        if self.ends.is_empty() {
-            self.ends.resize(model.end_count().div_ceil(64), 0);
+        if spring.is_anchor() {
+            return set_bit(&mut self.anchors, model.place_count(), spring.ends[0] as usize, is_severed);
         }
         for end in spring.ends_of(model) {
-            let bit = 1 << (end % 64);
-            if is_severed { self.ends[end / 64] |= bit } else { self.ends[end / 64] &= !bit }
+            set_bit(&mut self.ends, model.end_count(), end, is_severed);
         }
     }
 }
 
 impl SeveredSpring {
+    /// Returns the severed anchor spring of the point at a place in memory. `part` is that of the way from the point to where it is
+    /// attached.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn anchor(place: usize, part: f64, version: u32) -> Self {
+        SeveredSpring { ends: [place as u32; 2], number: ANCHOR, part, version }
+    }
+
+    pub(crate) fn is_anchor(&self) -> bool {
+        self.number == ANCHOR
+    }
+
     /// Returns the numbers of both of its ends among those of all places.
     fn ends_of(&self, model: &Model) -> [usize; 2] {
         let [first, second] = self.ends.map(|place| place as usize);
         let number = self.number as usize;
         [model.first_end(first) + number, model.first_end(second) + model.number_at_other_end(first, number)]
     }
+}
+
+/// Sets or clears one of `count` bits.
+fn set_bit(bits: &mut Vec<u64>, count: usize, which: usize, is_set: bool) {
+    if bits.is_empty() {
+        bits.resize(count.div_ceil(64), 0);
+    }
+    let bit = 1 << (which % 64);
+    if is_set { bits[which / 64] |= bit } else { bits[which / 64] &= !bit }
 }
 
 /// Returns the first place of the part to which a place belongs, and shortens the way to it.

@@ -79,7 +79,9 @@ impl<T: Real> Elastic<T> {
                     (push_of(*factor, volume_change), volume.over_mass(&places.slots, slot).to_array().map(T::of))
                 });
                 let first = places.slots.first_half(slot);
-                surface::gather(&places.slots, unit, *pull, pressed, u, slot, |number| severed.has(first + number))
+                let of_model = places.slots.extra_of(slot).or((severed.anchor_count() > 0).then_some(0.0));
+                let pull = (*pull, of_model.map(|of_model| severed.extra_anchor(of_model, slot)));
+                surface::gather(&places.slots, unit, pull, pressed, u, slot, |number| severed.has(first + number))
             }
         }
     }
@@ -245,6 +247,9 @@ impl<T: Real> SweepTables<T> {
         let [whole, severed] = self.severed.replace(model, cuts);
         whole.iter().for_each(|spring| self.set_spring(model, spring, false));
         severed.iter().for_each(|spring| self.set_spring(model, spring, true));
+        if let (Places::Surface(places), Some(mesh), 0) = (&model.places, &mut self.mesh, cuts.anchor_count()) {
+            mesh.springs.forget_anchors(&places.slots);
+        }
         let copies = self.severed.copies().cloned();
         if let (Some(solid), Some(places)) = (&mut self.solid, model.places.solid()) {
             solid.follow(places, &self.layout, copies.as_deref());
@@ -257,6 +262,35 @@ impl<T: Real> SweepTables<T> {
         mass_at(model, self.severed.copies().map(|copies| &**copies), place)
     }
 
+    /// Returns K″/m at a place in memory divided by the reference value, minus 1, after cuts.
+    pub(crate) fn extra_anchor_at(&self, model: &Model, place: usize) -> f64 {
+        self.severed.extra_anchor(model.extra_anchor_at(place), place)
+    }
+
+    /// Returns K″ at a place in memory, after cuts, N/m.
+    pub(crate) fn anchor_stiffness_at_n_per_m(&self, model: &Model, place: usize) -> f64 {
+        let relative = model.relative_mass_at(place) * (1.0 + self.extra_anchor_at(model, place));
+        model.scene.anchor_stiffness_n_per_m * relative
+    }
+
+    /// Returns the force of the springs on a point of a relative mass along an axis, N, from the gathered value of the tables in their
+    /// unit ([`Plan::spring_unit`]) and the displacement in spacings.
+    pub(crate) fn spring_force_n(
+        &self,
+        model: &Model,
+        [spring_unit, mass]: [f64; 2],
+        place: usize,
+        [gathered, u]: [f64; 2],
+    ) -> f64 {
+        let force_n = gathered / spring_unit;
+        if !model.places.differ() {
+            return force_n;
+        }
+        // Anchor stiffness beyond the reference K″ is not part of the springs.
+        let pulled_n = model.scene.anchor_stiffness_n_per_m * self.extra_anchor_at(model, place) * u * model.unit_m;
+        mass * (force_n + pulled_n)
+    }
+
     /// Writes to the tables whether a spring is severed, as the set of severed springs has it.
     fn set_spring(&mut self, model: &Model, spring: &SeveredSpring, is_severed: bool) {
         let [first, second] = spring.ends.map(|place| place as usize);
@@ -265,6 +299,9 @@ impl<T: Real> SweepTables<T> {
             (Places::Sheet(_), _) => {
                 let by = ENDS[number / 4][number % 4];
                 self.cuts.set(&self.layout, model.point_of(first), by, is_severed);
+            }
+            (Places::Surface(places), Some(mesh)) if spring.is_anchor() => {
+                mesh.springs.set_anchor(&places.slots, first, is_severed);
             }
             (Places::Surface(places), Some(mesh)) => {
                 mesh.springs.set(&places.slots, first, number, is_severed);

@@ -215,7 +215,7 @@ impl<'m> LinearPatch<'m> {
         Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
 
-    /// Takes the severed springs away, of a patch in the tissue's own directions; of a solid, the cubes with doubled corners, which are on
+    /// Takes the severed springs away, anchor springs too, of a patch in the tissue's own directions; of a solid, the cubes with doubled corners, which are on
     /// one side of a cut.
     pub(crate) fn without(mut self, cuts: &Cuts) -> Self {
         if let (Elements::Cells(cells), Some(copies)) = (&mut self.elements, cuts.copies()) {
@@ -224,6 +224,8 @@ impl<'m> LinearPatch<'m> {
             return self;
         }
         let within = |place: u32| self.window.find(self.model, self.model.point_of(place as usize));
+        let anchors = cuts.springs().iter().filter(|spring| spring.is_anchor());
+        let freed: Vec<usize> = anchors.filter_map(|spring| within(spring.ends[0])).collect();
         let found = cuts.springs().iter().filter_map(|spring| {
             let [first, second] = spring.ends;
             let rest =
@@ -232,7 +234,8 @@ impl<'m> LinearPatch<'m> {
         });
         let mut found: Vec<([usize; 2], DVec3)> = found.collect();
         found.sort_unstable_by_key(|(ends, _)| *ends);
-        if !found.is_empty() {
+        freed.iter().for_each(|at| self.own_n_per_m[*at] = 0.0);
+        if !found.is_empty() || !freed.is_empty() {
             self.elements.remove(&found);
             self.linearise();
         }

@@ -1,13 +1,15 @@
-//! How a tissue is cut: how it resists a blade, and when it tears.
+//! How a tissue is cut: how it resists a blade, when it tears, and where its anchor springs end.
+
+use glam::DVec3;
 
 use super::action_check::physical;
 use super::toml_document::Item;
-use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use palpate_refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive, unsigned_zero};
 
 /// The largest strain that may be given as the one at which a tissue tears.
 const MAX_TEAR_STRAIN: f64 = 10.0;
 
-/// How a tissue is cut: how it resists a blade, and when it tears.
+/// How a tissue is cut: how it resists a blade, when it tears, and where its anchor springs end.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Cutting {
     /// Fracture toughness Gc: the work that a cut takes for each unit of its area, J/m²; 0: a blade feels nothing. Porcine liver by a
@@ -23,6 +25,12 @@ pub struct Cutting {
     /// the strain ahead of a notch grows with 1/√distance (linear fracture mechanics), so that a notch in a finer mesh opens
     /// under the same load. `None`: all springs tear at the same strain.
     pub tear_reference_m: Option<f64>,
+    /// The length of the anchor springs of a surface at rest, m: so far beneath each point its anchor is attached to what bears the
+    /// tissue. A blade that crosses the line between both severs the anchor. `None`: nothing severs anchors.
+    pub anchor_depth_m: Option<f64>,
+    /// The direction from the points to where their anchors are attached, of any length above 0. `None`: into the tissue, against
+    /// the normal of each point.
+    pub anchor_direction: Option<DVec3>,
 }
 
 impl Cutting {
@@ -35,12 +43,15 @@ impl Cutting {
                 thickness_m: fields.number("thickness_m")?,
                 tear_strain: fields.number("tear_strain")?,
                 tear_reference_m: fields.number("tear_reference_m")?,
+                anchor_depth_m: fields.number("anchor_depth_m")?,
+                anchor_direction: fields.item("anchor_direction").map(|item| item.vector()).transpose()?,
             })
         })
     }
 
-    /// Checks the values.
-    pub(super) fn check(&self) -> Result<()> {
+    /// Checks the values; `has_surface` tells whether the tissue is a surface.
+    pub(super) fn check(&self, has_surface: bool) -> Result<()> {
+        self.check_anchors(has_surface)?;
         not_negative("cutting.toughness_j_per_m2", self.toughness_j_per_m2)?;
         self.thickness_m.map_or(Ok(()), |thickness_m| positive("cutting.thickness_m", thickness_m).map(drop))?;
         if let Some(strain) = self.tear_strain {
@@ -53,6 +64,39 @@ impl Cutting {
             return Err(Refusal::new(Reason::Missing, "cutting.tear_reference_m", message));
         }
         physical("cutting.tear_reference_m", reference_m).map(drop)
+    }
+
+    fn check_anchors(&self, has_surface: bool) -> Result<()> {
+        if let Some(depth_m) = self.anchor_depth_m {
+            if !has_surface {
+                let message = "is for [mesh]: only the anchor springs of a surface can be severed";
+                return Err(Refusal::new(Reason::WrongKind, "cutting.anchor_depth_m", message));
+            }
+            physical("cutting.anchor_depth_m", depth_m)?;
+        }
+        let Some(direction) = self.anchor_direction else { return Ok(()) };
+        if self.anchor_depth_m.is_none() {
+            let message = "goes with anchor_depth_m, the length of the anchors: give both";
+            return Err(Refusal::new(Reason::Missing, "cutting.anchor_direction", message));
+        }
+        physical("cutting.anchor_direction", finite_vector("cutting.anchor_direction", direction)?.length()).map(drop)
+    }
+
+    /// Returns the values with every −0 replaced by 0. Values that must be above 0 need no replacement.
+    #[must_use]
+    pub(super) fn with_unsigned_zeros(self) -> Self {
+        Cutting {
+            toughness_j_per_m2: unsigned_zero(self.toughness_j_per_m2),
+            thickness_m: self.thickness_m.map(unsigned_zero),
+            anchor_direction: self.anchor_direction.map(|direction| direction + DVec3::ZERO),
+            ..self
+        }
+    }
+
+    /// Returns the vector from a point to where its anchor is attached, m; `normal` is that of the surface at the point.
+    pub(crate) fn anchor_m(&self, normal: DVec3) -> Option<DVec3> {
+        let direction = self.anchor_direction.unwrap_or(-normal).normalize_or_zero();
+        self.anchor_depth_m.map(|depth_m| depth_m * direction)
     }
 
     /// Returns the strain beyond which a spring of `length_m` (m) tears; `None` if the tissue does not tear.

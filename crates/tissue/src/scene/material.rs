@@ -23,7 +23,7 @@ const MOVES_ALONG: f64 = 1.0 / 3.0;
 
 /// The material of a tissue on a mesh: an elastic capsule on a soft foundation. [`Material::applied`] checks
 /// it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Material {
     /// Young's modulus E of the capsule, Pa. Its Poisson ratio ν is 1/3.
     pub youngs_modulus_pa: f64,
@@ -39,6 +39,8 @@ pub struct Material {
     /// Damping ratio ζ of a point on its anchor spring alone, 0 to 100; 1 is critical. Without a foundation
     /// nothing is damped.
     pub damping_ratio: f64,
+    /// The group of the mesh whose vertices lie on the foundation; the others have no anchor springs. `None`: all do.
+    pub foundation_group: Option<String>,
 }
 
 /// A tissue made of a material, by [`Material::applied`]: the mesh, and the reference coefficients.
@@ -61,11 +63,19 @@ impl Material {
     /// Message of the refusal of a material or an inclusion on a sheet ([`Reason::WrongKind`]).
     pub const OF_A_MESH: &str = "is for a mesh: a sheet has the same points and springs all over";
 
-    /// Creates a material of usual soft tissue: density 1060 kg/m³, depth 0.03 m, damping ratio 0.5. The
+    /// Creates a material of usual soft tissue: density 1060 kg/m³, depth 0.03 m, damping ratio 0.5, a foundation everywhere. The
     /// arguments, Pa, m and N/m³, are not checked.
     pub fn new(youngs_modulus_pa: f64, thickness_m: f64, foundation_n_per_m3: f64) -> Self {
         let (density_kg_per_m3, depth_m, damping_ratio) = (1060.0, 0.03, 0.5);
-        Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, foundation_n_per_m3, damping_ratio }
+        Material {
+            youngs_modulus_pa,
+            thickness_m,
+            density_kg_per_m3,
+            depth_m,
+            foundation_n_per_m3,
+            damping_ratio,
+            foundation_group: None,
+        }
     }
 
     pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
@@ -77,6 +87,7 @@ impl Material {
             density_kg_per_m3: fields.number("density_kg_per_m3")?.unwrap_or(usual.density_kg_per_m3),
             depth_m: fields.number("depth_m")?.unwrap_or(usual.depth_m),
             damping_ratio: fields.number("damping_ratio")?.unwrap_or(usual.damping_ratio),
+            foundation_group: fields.text("foundation_group")?,
             ..usual
         })
     }
@@ -95,6 +106,15 @@ impl Material {
         }
         number("material.damping_ratio", self.damping_ratio, "from 0 to 100", |v| (0.0..=100.0).contains(&v))?;
         Ok(())
+    }
+
+    /// Returns K″/m of each vertex divided by the reference value, minus 1: −1 beside the foundation. Empty if it is everywhere.
+    fn extra_anchor(&self, shape: &MeshShape) -> Result<Vec<f64>> {
+        let Some(name) = &self.foundation_group else { return Ok(Vec::new()) };
+        let group = group_named("material.foundation_group", name, &shape.told().groups)?;
+        let mut extra = vec![-1.0; shape.vertices_m().len()];
+        group.vertices.iter().for_each(|vertex| extra[*vertex as usize] = 0.0);
+        Ok(extra)
     }
 
     /// Returns a tissue of this material. `bending` is the k of the bending springs relative to that of the
@@ -117,7 +137,7 @@ impl Material {
     ///
     /// # Errors
     /// Refuses a modulus, thickness, density or depth beyond 1e-12 to 1e12; a foundation that is neither 0 nor
-    /// in this range; a damping ratio beyond 0 to 100; and a mesh with a vertex that has edges but no area
+    /// in this range; a damping ratio beyond 0 to 100; a group that the mesh does not have; and a mesh with a vertex that has edges but no area
     /// ([`Reason::Unreadable`]).
     pub fn applied(&self, bending: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
         self.check()?;
@@ -148,7 +168,7 @@ impl Material {
             .map(|(vertex, area_m2)| if shape.is_used(vertex) { area_m2 / mean_m2 } else { 1.0 });
         let differences = PerNodeFactors {
             relative_mass: relative_mass.collect(),
-            extra_anchor: Vec::new(),
+            extra_anchor: self.extra_anchor(&shape)?,
             edges: relative(&edges),
             bending: relative(&across),
         };
@@ -428,6 +448,7 @@ mod tests {
         depth_m: 0.03,
         foundation_n_per_m3: 9e5,
         damping_ratio: 0.5,
+        foundation_group: None,
     };
 
     /// A flat patch of triangles with equal sides, its inner points moved by up to `jitter` edges.
@@ -502,6 +523,27 @@ mod tests {
         // 2ζ√(k″·ρH/3) on each m².
         let damping = made.damping_n_s_per_m / made.anchor_stiffness_n_per_m * 9e5;
         assert!((damping - (9e5_f64 * 10.0).sqrt()).abs() < 1e-6 * damping, "{damping}");
+    }
+
+    #[test]
+    fn beside_the_group_of_a_foundation_no_vertex_has_an_anchor() {
+        let mut text = crate::compile::square_of_triangles([4, 4], 0.01);
+        text += "g bed\nf 1 6 7\n";
+        let scene = |group: &str| {
+            let scene = format!(
+                "[mesh]\nfile = \"square.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = 5e3\nthickness_m = 0.01\n\
+                 foundation_n_per_m3 = 9e5\nfoundation_group = \"{group}\"\n"
+            );
+            let mesh = ("square.obj", text.as_bytes());
+            crate::scene::Scene::parse_given("square", &scene, mesh, &crate::limits::Limits::default())
+        };
+        let found = scene("bed").unwrap();
+        for point in crate::shape::points(found.shape()) {
+            let expected = if [0, 5, 6].contains(&point.index()) { found.relative_mass(point) } else { 0.0 };
+            assert_eq!(found.relative_anchor_stiffness(point), expected, "{point:?}");
+        }
+        let refusal = scene("bad").unwrap_err();
+        assert_eq!(refusal.field, "material.foundation_group");
     }
 
     #[test]

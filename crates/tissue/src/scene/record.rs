@@ -252,12 +252,20 @@ pub struct Summary {
 pub struct TopologyRecord {
     /// Version of the topology: 0 if nothing was severed ([`Cuts::version`](crate::Cuts::version)).
     pub topology_version: u32,
-    /// Number of severed springs.
+    /// Number of severed springs, anchor springs included.
     pub severed: usize,
+    /// How many of them are anchor springs; not written if there are none.
+    #[serde(skip_serializing_if = "is_none")]
+    pub severed_anchors: usize,
     /// Number of parts of the tissue; 1 for one that is whole.
     pub pieces: usize,
     /// Energy that has gone into separation, J ([`Cuts::fracture_j`](crate::Cuts::fracture_j)).
     pub fracture_j: f64,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_none(count: &usize) -> bool {
+    *count == 0
 }
 
 /// What a thread or clip bore in a run.

@@ -13,7 +13,7 @@ use super::action::PlaceMark;
 use super::profile::Poke;
 use super::script::Action;
 use super::tie::{Bite, Tie, TieKind};
-use super::{Cutting, Scene, Springs};
+use super::{Scene, Springs};
 use palpate_refusal::unsigned_zero;
 
 fn unsigned(v: DVec3) -> DVec3 {
@@ -49,7 +49,7 @@ impl Scene {
             stepping,
             sleep_tolerance,
             appearance,
-            cutting: Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m },
+            cutting,
         } = self;
         Scene {
             name,
@@ -68,12 +68,7 @@ impl Scene {
             stepping,
             sleep_tolerance: sleep_tolerance.map(unsigned_zero),
             appearance,
-            cutting: Cutting {
-                toughness_j_per_m2: unsigned_zero(toughness_j_per_m2),
-                thickness_m: thickness_m.map(unsigned_zero),
-                tear_strain,
-                tear_reference_m,
-            },
+            cutting: cutting.with_unsigned_zeros(),
         }
     }
 }

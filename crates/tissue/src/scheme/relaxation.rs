@@ -28,6 +28,12 @@ impl Relaxation {
         }
     }
 
+    /// Returns how the same tissue comes back to rest if some of its points have lost their anchors.
+    #[must_use]
+    pub(crate) fn without_anchors(self) -> Self {
+        Relaxation { restoring_n_per_m: 0.0, ..self }
+    }
+
     /// Returns the stiffness that pulls a displaced point back wherever the others are, N/m; 0 if nothing does.
     pub fn restoring_n_per_m(&self) -> f64 {
         self.restoring_n_per_m

@@ -1,4 +1,4 @@
-//! What is severed in a step: by the edges of blades, by heat (`burning`), and by strain (`tearing`).
+//! What is severed in a step: by the edges of blades (anchor springs in `anchors`), by heat (`burning`), and by strain (`tearing`).
 //!
 //! In a step the edge of a blade sweeps a surface, from the line between its tip and its heel at the step's beginning to that at
 //! the step's end: two triangles. A spring that crosses one of them is severed. The tissue moves as well, so the edge
@@ -20,7 +20,7 @@
 use glam::DVec3;
 
 use crate::body::model::{Model, displacement_m};
-use crate::body::severed::SeveredSpring;
+use crate::body::severed::{ANCHOR, SeveredSpring};
 use crate::body::spring_ends::SpringEnd;
 use crate::body::spring_search::{NearTile, SpringSearch};
 use crate::kernel::real::Real;
@@ -135,6 +135,7 @@ impl<T: Real> TissueState<T> {
         let crossed =
             |sweep| if self.model.places.solid().is_some() { self.crossed_faces(sweep) } else { self.crossed(sweep) };
         let mut crossings: Vec<Crossing> = sweeps.iter().flat_map(crossed).collect();
+        crossings.extend(sweeps.iter().flat_map(|sweep| self.crossed_anchors(sweep)));
         crossings.extend(burnt);
         crossings.extend(self.torn());
         crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
@@ -159,8 +160,9 @@ impl<T: Real> TissueState<T> {
         self.ended(StepStage::Contact);
     }
 
-    /// Lets tools act on the copies of corners that there are now.
+    /// Lets tools act on the copies of corners that there are now, and tiles sleep as far as the anchors that are left allow.
     pub(super) fn follow_cuts(&mut self) {
+        self.tiles.has_severed_anchors = self.tables.severed.anchor_count() > 0;
         let copies = self.tables.severed.copies().cloned();
         self.contacts.follow_cuts(&self.model, copies.as_ref());
         if let Some(copies) = &copies {
@@ -252,6 +254,9 @@ impl<T: Real> TissueState<T> {
     #[allow(clippy::cast_possible_truncation)]
     fn sever(&mut self, crossing: &Crossing, version: u32) -> bool {
         let Crossing { place, spring, part } = *crossing;
+        if spring.number == ANCHOR as usize {
+            return self.sever_anchor(SeveredSpring::anchor(place, part, version));
+        }
         let ends = [place, spring.other];
         let severed =
             SeveredSpring { ends: ends.map(|place| place as u32), number: spring.number as u32, part, version };
@@ -281,21 +286,26 @@ impl<T: Real> TissueState<T> {
         let released_j = tension_n_per_m * rest_m.dot(delta_m) + stored_j;
         self.work.add(-released_j);
         self.tables.severed.add_fracture(released_j);
-        let unit = self.plan.spring_unit(&model.scene);
+        self.take_from_history(place, force_n);
+        self.take_from_history(spring.other, -force_n);
+        true
+    }
+
+    /// Takes the present force of a severed spring on the point at a place, N, out of the past forces that a multistep scheme keeps.
+    fn take_from_history(&mut self, place: usize, force_n: DVec3) {
+        let (model, layout) = (&self.model, self.tables.layout);
+        let change = self.plan.spring_unit(&model.scene) / model.relative_mass_at(place) * force_n;
         let history = self.plan.scheme.history();
-        for (place, force_n) in ends.into_iter().zip([force_n, -force_n]) {
-            let change = unit / model.relative_mass_at(place) * force_n;
-            for kept in &mut self.state.kept[..history] {
-                let kept = std::sync::Arc::make_mut(kept);
-                for c in 0..3 {
-                    kept[c * layout.plane + layout.offset(place)] -= T::of(change[c]);
-                }
+        for kept in &mut self.state.kept[..history] {
+            let kept = std::sync::Arc::make_mut(kept);
+            for c in 0..3 {
+                kept[c * layout.plane + layout.offset(place)] -= T::of(change[c]);
             }
         }
-        true
     }
 }
 
+mod anchors;
 mod burning;
 mod faces;
 mod tearing;

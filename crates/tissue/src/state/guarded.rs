@@ -130,12 +130,14 @@ impl<T: Real> TissueState<T> {
     #[allow(clippy::cast_precision_loss)]
     fn gaping_j(&self) -> f64 {
         let TissueState { model, tables, state, .. } = self;
-        let springs = tables.severed.springs();
-        if model.prestrain == 0.0 || springs.is_empty() {
+        if model.prestrain == 0.0 || tables.severed.joint_count() == 0 {
             return 0.0;
         }
+        // Anchor springs have no pretension.
+        let springs: Vec<&SeveredSpring> =
+            tables.severed.springs().iter().filter(|spring| !spring.is_anchor()).collect();
         let each = springs.len().div_ceil(MAX_GAPING);
-        let of = |spring: &SeveredSpring| {
+        let of = |spring: &&SeveredSpring| {
             let [a, b] = spring.ends.map(|place| {
                 let place = place as usize;
                 let rest_m = model.shape().rest_m(model.point_at(place));
@@ -221,6 +223,7 @@ impl<T: Real> TissueState<T> {
         self.contacts.clone_from(&checkpoint.contacts);
         self.work = checkpoint.work;
         self.tables.set_severed(&self.model, &checkpoint.cuts);
+        self.tiles.has_severed_anchors = self.tables.severed.anchor_count() > 0;
         let was = checkpoint.halvings;
         self.halve(was, halvings);
         self.tables.is_settled(0.0);

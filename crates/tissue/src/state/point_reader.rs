@@ -53,7 +53,7 @@ impl<T: Real> PointReader<'_, T> {
             (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
         }
         let mass = self.tables.relative_mass_at(model, index);
-        let anchor_n = -scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index) * displacement_m;
+        let anchor_n = -self.tables.anchor_stiffness_at_n_per_m(model, index) * displacement_m;
         let damping_n = -scene.damping_n_s_per_m * mass * velocity_m_per_s;
         let constraint_n = motion.map(|motion| {
             let inertia_n = scene.point_mass_kg() * mass * motion.acceleration_m_per_s2;
@@ -66,10 +66,9 @@ impl<T: Real> PointReader<'_, T> {
     /// force-controlled tools; before the first step without the latter.
     pub(super) fn force_on_free_n(&self, index: usize, mass: f64) -> DVec3 {
         let scene = &self.model.scene;
-        let of_stiffness = self.model.relative_anchor_stiffness_at(index);
         let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(self.model, index) };
         let [u, v, spring_n] = self.free_point(index, applied_n);
-        let anchor_n = -of_stiffness * scene.anchor_stiffness_n_per_m * u;
+        let anchor_n = -self.tables.anchor_stiffness_at_n_per_m(self.model, index) * u;
         let damping_n = -mass * scene.damping_n_s_per_m * v;
         spring_n + anchor_n + damping_n + applied_n
     }
@@ -139,7 +138,8 @@ impl<T: Real> SingleWork for Observation<'_, '_, T> {
                     added += plan.added_weights[k] * kept[k - 1].0;
                 }
             }
-            found[2][c] = model.spring_force_n([reader.spring_unit, mass], index, n.0 + added, state.u[at].wide());
+            let of_axis = [n.0 + added, state.u[at].wide()];
+            found[2][c] = tables.spring_force_n(model, [reader.spring_unit, mass], index, of_axis);
         }
         found
     }

@@ -258,8 +258,9 @@ fn states<T: Real>(
         let vector = |field: &Field<T>| DVec3::from_array([0, 1, 2].map(|c| field[at(c)].wide()));
         let (u, springs) =
             (vector(&state.u), tables.springs.gather(&tables.severed, &tables.layout, &state.u, volume_change, point));
-        let spring_n = [0, 1, 2].map(|c| model.spring_force_n([spring_unit, mass], index, springs[c].wide(), u[c]));
-        let place_n_per_m = model.scene.anchor_stiffness_n_per_m * model.relative_anchor_stiffness_at(index);
+        let spring_n =
+            [0, 1, 2].map(|c| tables.spring_force_n(model, [spring_unit, mass], index, [springs[c].wide(), u[c]]));
+        let place_n_per_m = tables.anchor_stiffness_at_n_per_m(model, index);
         let u_m = model.unit_m * u;
         UnderTip { mass, u_m, d: vector(&state.d), pull_n: DVec3::from_array(spring_n) - place_n_per_m * u_m }
     };

@@ -115,6 +115,11 @@ impl Model {
         for value in [scene.cutting.tear_strain, scene.cutting.tear_reference_m].into_iter().flatten() {
             add(&value.to_bits().to_le_bytes());
         }
+        // So does one whose anchors can't be severed.
+        if let Some(depth_m) = scene.cutting.anchor_depth_m {
+            let direction = scene.cutting.anchor_direction.unwrap_or_default().to_array();
+            [depth_m].into_iter().chain(direction).for_each(|value| add(&value.to_bits().to_le_bytes()));
+        }
         add(&[u8::from(scene.springs.bending)]);
         add(self.plan.integrator.name().as_bytes());
         add(&self.plan.substeps.to_le_bytes());

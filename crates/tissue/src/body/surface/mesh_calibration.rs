@@ -57,7 +57,9 @@ impl MeshTrial {
     pub fn force(&self, vertex: usize) -> DVec3 {
         let FreeMotion { slots, unit, pull, state, .. } = &self.0;
         let slot = slots.slot_of()[vertex] as usize;
-        DVec3::from_array(gather(slots, unit, *pull, None, &state.u, slot, |_| false).map(f64::from))
+        DVec3::from_array(
+            gather(slots, unit, (*pull, slots.extra_of(slot)), None, &state.u, slot, |_| false).map(f64::from),
+        )
     }
 }
 

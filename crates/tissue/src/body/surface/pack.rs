@@ -24,6 +24,9 @@ use crate::memory;
 /// Number of coefficients of a spring.
 pub(super) const COEFFICIENTS: usize = 5;
 
+/// The extra K″/m of a slot without an anchor spring, divided by the reference value.
+pub(crate) const NO_ANCHOR: f64 = -1.0;
+
 /// Which of them is the stiffness, the last.
 const STIFFNESS: usize = 4;
 
@@ -145,6 +148,20 @@ impl<T: Real> MeshSprings<T> {
         let loads = self.loads.get_or_insert_with(|| Field::of_length(3 * plane));
         for c in 0..3 {
             loads[c * plane + slot] = T::of(load[c]);
+        }
+    }
+
+    /// Severs or restores the anchor spring of a slot.
+    pub(crate) fn set_anchor(&mut self, slots: &MeshSlots, slot: usize, is_severed: bool) {
+        let count = self.slots;
+        let extra = self.extra.get_or_insert_with(|| Field::of_length(count));
+        extra[slot] = T::of(if is_severed { NO_ANCHOR } else { slots.extra_at(slot) });
+    }
+
+    /// Forgets that anchor springs were severed, once all are whole again.
+    pub(crate) fn forget_anchors(&mut self, slots: &MeshSlots) {
+        if slots.extra().is_empty() {
+            self.extra = None;
         }
     }
 

@@ -193,6 +193,11 @@ impl MeshSlots {
         self.extra.get(slot).copied().unwrap_or(0.0)
     }
 
+    /// Returns K″/m of a slot divided by the reference value, minus 1; `None` if it is 0 everywhere.
+    pub(crate) fn extra_of(&self, slot: usize) -> Option<f64> {
+        self.extra.get(slot).copied()
+    }
+
     /// Returns the extra K″/m of the slots divided by the reference value. Empty if all are 0.
     pub(super) fn extra(&self) -> &[f64] {
         &self.extra

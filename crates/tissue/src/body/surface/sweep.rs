@@ -622,12 +622,12 @@ impl<V: Vector> Strain<V> {
 }
 
 /// Returns the force of the springs and of the extra anchor stiffness on one slot, minus the pressure
-/// `pressed`. Of a spring that `is_severed`, by its number, only the load that held the rest shape against its pretension is left. For a few single points. `unit` and `pull` as in [`MeshGrid`].
+/// `pressed`. `extra` is the extra K″/m divided by the reference value, if the slots differ in it. Of a spring that `is_severed`, by its number, only the load that held the rest shape against its pretension is left. For a few single points. `unit` and `pull` as in [`MeshGrid`].
 #[inline(always)]
 pub(crate) fn gather<T: Real>(
     slots: &MeshSlots,
     unit: &SpringCoefficients<T>,
-    pull: T,
+    (pull, extra): (T, Option<f64>),
     pressed: Option<(T, [T; 3])>,
     u: &[T],
     slot: usize,
@@ -651,8 +651,8 @@ pub(crate) fn gather<T: Real>(
             sum.add::<false, false>(unit, &strain, coefficients.as_ptr());
         }
     }
-    if !slots.extra().is_empty() {
-        let pull = Scalar(pull * T::of(slots.extra()[slot]));
+    if let Some(extra) = extra {
+        let pull = Scalar(pull * T::of(extra));
         for c in 0..3 {
             sum.force[c] = sum.force[c].minus(pull, own[c]);
         }

@@ -185,8 +185,8 @@ fn pulls_as_the_reference<T: Real>() {
                 let near = (found - force).abs().cmple(within).all();
                 assert!(near, "{count} {valence} {strain} {vertex}: {found} {force} ± {within}");
                 let slot = slots.slot_of()[vertex] as usize;
-                let alone =
-                    gather(&slots, &SpringCoefficients::<T>::new(SCALE, 1.0), T::of(PULL), None, &u, slot, |_| false);
+                let unit = SpringCoefficients::<T>::new(SCALE, 1.0);
+                let alone = gather(&slots, &unit, (T::of(PULL), slots.extra_of(slot)), None, &u, slot, |_| false);
                 let swept = std::array::from_fn(|c| n[c * slots.layout::<T>().plane + slot]);
                 assert_eq!(alone, swept, "{count} {valence} {strain} {vertex}");
             }

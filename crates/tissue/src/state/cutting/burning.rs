@@ -3,7 +3,8 @@
 //! A tip burns the points that its disc covers, the same that it presses or holds, for as long as it touches or holds them. Their times of contact
 //! add up, under one tip or several, and stay when the tip goes. A spring is severed in its middle once both of its ends have burnt
 //! for as long as the tip that is at one of them takes (`Tip::burn_s`), and springs that resist bending go as in a tear
-//! (`tearing`). Before that, the tissue does not become stiffer.
+//! (`tearing`). The anchor spring of a point that has burnt for so long is severed too, if anchors can be (`anchors`). Before that, the
+//! tissue does not become stiffer.
 
 use std::collections::BTreeSet;
 
@@ -28,10 +29,11 @@ impl<T: Real> TissueState<T> {
         // A point under two tips burns once.
         let places: BTreeSet<usize> = under.iter().flat_map(|(_, places)| places).copied().collect();
         places.into_iter().for_each(|place| burns.add_step(place));
-        let mut found = Vec::new();
+        let (mut found, mut through) = (Vec::new(), Vec::new());
         for (burn_s, places) in under {
             let is_through = |place| f64::from(burns.steps_at(place)) / model.scene.stepping.rate_hz >= burn_s;
             for place in places.into_iter().filter(|place| is_through(*place)) {
+                through.push(place);
                 let first_end = model.first_end(place);
                 model.each_spring(place, |spring| {
                     if is_through(spring.other) && !tables.severed.has(first_end + spring.number) {
@@ -42,6 +44,7 @@ impl<T: Real> TissueState<T> {
         }
         let bending = self.unspanned(&found);
         found.extend(bending);
+        found.extend(through.into_iter().filter_map(|place| self.anchor_in_middle(place)));
         found
     }
 }

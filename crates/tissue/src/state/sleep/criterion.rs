@@ -36,7 +36,8 @@ pub(crate) fn wake_pushed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, app
         if stiffness > 0.0 {
             tiles.largest = tiles.largest.max(change.peak_n() / (stiffness * spacing_m));
         }
-        let least_n = Relaxation::of(&model.scene).restoring_n_per_m() * tiles.wake_threshold(&model.scene) * spacing_m;
+        let least_n =
+            tiles.relaxation(&model.scene).restoring_n_per_m() * tiles.wake_threshold(&model.scene) * spacing_m;
         tiles.pushed(&change, spacing_m, least_n);
     }
 }
@@ -97,12 +98,8 @@ pub(crate) fn add_sleeping<T: Real>(
 pub(crate) fn wake_pressed<T: Real>(tiles: &mut SleepTiles<T>, model: &Model, volume_change: f64, far: f64) {
     let Some(volume) = model.places.volume() else { return };
     let stiffness = model.scene.volume_stiffness_pa * volume.stretch_m;
-    tiles.wake_pressed(
-        volume_change,
-        &volume.reaches,
-        stiffness,
-        far * Relaxation::of(&model.scene).restoring_n_per_m(),
-    );
+    let least = far * tiles.relaxation(&model.scene).restoring_n_per_m();
+    tiles.wake_pressed(volume_change, &volume.reaches, stiffness, least);
 }
 
 /// Puts calm tiles to sleep, under the pressure that belongs to `volume_change`.
@@ -123,7 +120,7 @@ pub(crate) fn put_to_sleep<T: Real>(
     // In the scheme's units of force and velocity: the anchor springs, drag, and the stiffness that pulls a point back.
     let sheet = Oscillator::of(&model.scene);
     let Coefficients { anchor: anchor_stiffness, damping: drag, .. } = sheet.scaled(plan.substep_s);
-    let relaxation = Relaxation::of(&model.scene);
+    let relaxation = tiles.relaxation(&model.scene);
     let restoring = relaxation.scaled(plan.substep_s);
     // A displacement is known to half its last digit. The spring force that this rounding causes moves
     // nothing: it differs from point to point, and a point between its neighbours yields by as little. Nor

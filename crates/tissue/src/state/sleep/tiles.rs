@@ -21,8 +21,8 @@
 //! last one, a record adds the energies that sleeping tiles store, and a hash knows which tiles are 0.
 //!
 //! ε is a quarter of `[sleep] tolerance`, because errors of tiles add up, to 3.4 ε in a sheet that creeps in
-//! one direction. Without anchor springs (K″ = 0) nothing bounds the effect of an omitted force, and only tiles
-//! that do not move at all sleep.
+//! one direction. Without anchor springs (K″ = 0), or once one is severed, nothing bounds the effect of an omitted force, and
+//! only tiles that do not move at all sleep.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -106,6 +106,8 @@ pub(crate) struct SleepTiles<T> {
     points: usize,
     /// The sleep tolerance; at 0 nothing sleeps.
     tolerance: f64,
+    /// Whether anchor springs are severed, so that nothing bounds how far an omitted force would move a point.
+    pub(crate) has_severed_anchors: bool,
     pub(crate) region: Region,
     pub(crate) awake_points: usize,
     /// For each tile, consecutive checks at which it was calm.
@@ -149,6 +151,7 @@ impl<T: Real> SleepTiles<T> {
             rows,
             points,
             tolerance,
+            has_severed_anchors: false,
             region: Region::none(&layout),
             awake_points: 0,
             settled: memory::zeroed(count, TABLES),
@@ -288,7 +291,7 @@ impl<T: Real> SleepTiles<T> {
     /// Returns ε_w, the movement of a neighbour that wakes a tile, in spacings.
     pub(crate) fn wake_threshold(&self, scene: &Scene) -> f64 {
         let epsilon = self.epsilon();
-        let relaxation = Relaxation::of(scene);
+        let relaxation = self.relaxation(scene);
         let restoring = relaxation.restoring_n_per_m();
         let ratio = restoring / scene.springs.stiffness_n_per_m / scene.body.kind().unevenness();
         // Without springs nothing passes from tile to tile.
@@ -298,7 +301,14 @@ impl<T: Real> SleepTiles<T> {
     }
 
     fn epsilon_of(&self, largest: f64) -> f64 {
-        PART * self.tolerance * largest
+        let most = if self.has_severed_anchors { f64::MIN_POSITIVE } else { f64::INFINITY };
+        PART * self.tolerance.min(most) * largest
+    }
+
+    /// Returns how the tissue of a scene comes back to rest, after cuts.
+    pub(crate) fn relaxation(&self, scene: &Scene) -> Relaxation {
+        let relaxation = Relaxation::of(scene);
+        if self.has_severed_anchors { relaxation.without_anchors() } else { relaxation }
     }
 
     /// Returns the tile of a point.
