@@ -349,7 +349,7 @@ fn scenes_and_scripts_are_found_by_name() {
     refused(
         &palpate(&["run", "yours", "mine"]),
         &[
-            "there is no scene `yours`; there are colon, fibrotic, gallbladder, kidney, liver, liver-organ, liver-solid, mine, paper, phantom, prostate, stomach; give your own scene by its path",
+            "there is no scene `yours`; there are colon, fibrotic, gallbladder, gallbladder-bed, kidney, liver, liver-organ, liver-solid, mine, paper, phantom, prostate, stomach; give your own scene by its path",
         ],
     );
     refused(&palpate(&["run", "liverr", "mine"]), &["there is no scene `liverr`", "; did you mean `liver`?"]);
@@ -364,7 +364,7 @@ fn scenes_and_scripts_are_found_by_name() {
     for name in ["firm", "poke"] {
         std::fs::copy(folder.path().join("scenes/mine.toml"), folder.path().join(format!("{name}.toml"))).unwrap();
     }
-    let meant = "there are colon, fibrotic, gallbladder, kidney, liver, liver-organ, liver-solid, mine, paper, phantom, prostate, stomach; did you mean the file `firm.toml`?";
+    let meant = "there are colon, fibrotic, gallbladder, gallbladder-bed, kidney, liver, liver-organ, liver-solid, mine, paper, phantom, prostate, stomach; did you mean the file `firm.toml`?";
     refused(&palpate(&["check", "firm"]), &["there is no scene `firm`", meant]);
     refused(
         &palpate(&["run", "paper", "poke"]),

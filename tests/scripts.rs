@@ -97,6 +97,26 @@ fn lift_lifts_a_lobe_and_lets_it_go() {
     assert_eq!(records.last().unwrap()["instruments"], serde_json::Value::Null);
 }
 
+/// A gallbladder that its bed and its neck hold.
+#[test]
+fn dissect_frees_a_gallbladder_from_its_bed_and_takes_it_away() {
+    let scene = built_in("gallbladder-bed", &[]);
+    let model = model(&scene);
+    let anchored = model.points().filter(|point| model.anchor_stiffness_n_per_m(*point) > 0.0).count();
+    let (records, summary) = run_whole(&model, &shipped("dissect", &scene), false);
+    let topology = summary.topology.unwrap();
+    assert_eq!((topology.severed_anchors, topology.pieces), (anchored, 2));
+    assert!(anchored > 200 && topology.severed > anchored, "{topology:?}");
+    assert_eq!(summary.guard_events, 0);
+    let pulled_n = |time_s: f64| {
+        let record = records.iter().find(|record| record["time_s"].as_f64() >= Some(time_s)).unwrap();
+        let parts = &record["tools"][0]["force_on_tool_n"];
+        DVec3::from_array([0, 1, 2].map(|axis| parts[axis].as_f64().unwrap())).length()
+    };
+    // Free of its bed, it is held by its neck; then nothing pulls at the grasper any more.
+    assert!(pulled_n(7.4) > 0.05 && pulled_n(10.5) < 0.1 * pulled_n(7.4), "{} N, {} N", pulled_n(7.4), pulled_n(10.5));
+}
+
 #[test]
 fn records_tell_what_a_tip_feels_and_where_it_is() {
     let scene = built_in("liver", &[]);

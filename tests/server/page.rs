@@ -216,6 +216,7 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
         [
             "cut",
             "cut-solid",
+            "dissect",
             "grasp",
             "lift",
             "oblique-100",

@@ -12,6 +12,7 @@ const KNOWN: Record<string, [title: string, group: Group]> = {
   prostate: ["Prostate with two nodules", "Organs"],
   colon: ["Colon", "Organs"],
   gallbladder: ["Gallbladder", "Organs"],
+  "gallbladder-bed": ["Gallbladder in its bed", "Organs"],
   liver: ["Liver", "Slabs of tissue"],
   fibrotic: ["Scarred liver", "Slabs of tissue"],
   stomach: ["Stomach wall", "Slabs of tissue"],

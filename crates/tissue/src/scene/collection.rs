@@ -271,7 +271,7 @@ mod tests {
         assert_eq!(refused.reason, Reason::UnknownScene);
         assert!(
             refused.message.ends_with(
-                "there are colon, fibrotic, gallbladder, kidney, liver, liver-organ, liver-solid, paper, phantom, prostate, stomach; did you mean `paper`?"
+                "there are colon, fibrotic, gallbladder, gallbladder-bed, kidney, liver, liver-organ, liver-solid, paper, phantom, prostate, stomach; did you mean `paper`?"
             ),
             "{refused}"
         );

@@ -65,10 +65,11 @@ pub const PAPER: &str = include_str!("../../../../scenes/paper.toml");
 
 /// The built-in scenes: name and TOML text, by ascending name. Some have a mesh, which is generated: none names
 /// a file.
-pub const BUILT_IN: [(&str, &str); 11] = [
+pub const BUILT_IN: [(&str, &str); 12] = [
     ("colon", include_str!("../../../../scenes/colon.toml")),
     ("fibrotic", include_str!("../../../../scenes/fibrotic.toml")),
     ("gallbladder", include_str!("../../../../scenes/gallbladder.toml")),
+    ("gallbladder-bed", include_str!("../../../../scenes/gallbladder-bed.toml")),
     ("kidney", include_str!("../../../../scenes/kidney.toml")),
     ("liver", include_str!("../../../../scenes/liver.toml")),
     ("liver-organ", include_str!("../../../../scenes/liver-organ.toml")),

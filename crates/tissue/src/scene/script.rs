@@ -14,9 +14,10 @@ use palpate_haptics::{ContactLoad, InstrumentContact, InstrumentPose, PortLoad};
 
 /// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
 /// ([`made_for`](super::script_reader::made_for)).
-pub const BUILT_IN: [(&str, &str); 11] = [
+pub const BUILT_IN: [(&str, &str); 12] = [
     ("cut", include_str!("../../../../scripts/cut.toml")),
     ("cut-solid", include_str!("../../../../scripts/cut-solid.toml")),
+    ("dissect", include_str!("../../../../scripts/dissect.toml")),
     ("grasp", include_str!("../../../../scripts/grasp.toml")),
     ("lift", include_str!("../../../../scripts/lift.toml")),
     ("oblique-100", include_str!("../../../../scripts/oblique-100.toml")),
