@@ -250,7 +250,7 @@ fn models() -> Vec<Arc<Model>> {
         scene_with(ORGAN, &[]),
         scene_with(BLOCK, &["stepping.precision=f32"]),
         sheet(&["stepping.precision=f64", tears]),
-        scene_with(ORGAN, &[tears]),
+        scene_with(ORGAN, &[tears, "cutting.anchor_depth_m=0.004"]),
         scene_with(BLOCK, &["stepping.precision=f64", tears]),
     ];
     scenes.iter().map(model).collect()

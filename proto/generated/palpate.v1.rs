@@ -4355,7 +4355,7 @@ pub struct Cutting {
     /// tear at the same strain.
     #[prost(double, optional, tag = "4")]
     pub tear_reference_m: ::core::option::Option<f64>,
-    /// On a mesh: length of the anchor springs, m; above 0. So far beneath each point its anchor is attached, and a blade that crosses the
+    /// On a sheet or a mesh: length of the anchor springs, m; above 0. So far beneath each point its anchor is attached, and a blade that crosses the
     /// line between both severs the anchor. Absent: nothing severs anchors.
     #[prost(double, optional, tag = "5")]
     pub anchor_depth_m: ::core::option::Option<f64>,
@@ -7645,7 +7645,7 @@ pub struct GetTopologyResponse {
     /// Whether the list begins after `since_version`; otherwise it replaces what the client knows.
     #[prost(bool, tag = "2")]
     pub continues: bool,
-    /// In the order in which they were severed.
+    /// Those between points, without anchor springs, in the order in which they were severed.
     #[prost(message, repeated, tag = "3")]
     pub severed: ::prost::alloc::vec::Vec<SeveredSpring>,
     /// Number of parts of the tissue; 1 if it is whole.

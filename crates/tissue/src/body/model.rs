@@ -315,7 +315,7 @@ impl Model {
     /// to 0.)
     pub(crate) fn has_severable_anchor(&self, index: usize) -> bool {
         let is_anchored = self.relative_anchor_stiffness_at(index) > 0.0;
-        let is_point = self.places.joined(index).next().is_some();
+        let is_point = matches!(self.places, Places::Sheet(_)) || self.places.joined(index).next().is_some();
         let is_free = self.fixed.binary_search(&index).is_err();
         self.scene.cutting.anchor_depth_m.is_some() && is_point && is_anchored && is_free
     }

@@ -13,13 +13,15 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::Model;
 use crate::body::solid::corner_copies::{CornerCopies, DoubledCorner};
-use crate::body::surface::NO_ANCHOR;
 use crate::saved::{SavedSpring, ensure, unsound};
 use crate::shape::PointId;
 use palpate_refusal::Result;
 
 /// Versions in a snapshot are below this, so that counting on does not overflow.
 const MAX_VERSION: u32 = u32::MAX / 2;
+
+/// The extra K″/m of a point without an anchor spring, divided by the reference value.
+pub(crate) const NO_ANCHOR: f64 = -1.0;
 
 /// The number of the anchor spring of a point, beside those of its other springs.
 pub(crate) const ANCHOR: u32 = u32::MAX;

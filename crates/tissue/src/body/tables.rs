@@ -19,7 +19,7 @@ use crate::body::spring_ends::SHEET_ENDS;
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
-use crate::kernel::lanes::{self, SingleWork, Width};
+use crate::kernel::lanes::{self, Scalar, SingleWork, Vector, Width};
 use crate::kernel::real::Real;
 use crate::kernel::region::Region;
 use crate::kernel::springs::{ENDS, SpringCoefficients, Springs};
@@ -32,7 +32,8 @@ const FEW: usize = 4;
 /// The springs of a tissue, with forces in a scheme's units.
 #[derive(Debug, Clone)]
 pub(crate) enum Elastic<T> {
-    Sheet(Springs<T>),
+    /// A sheet: its springs, and the factor of the extra anchor stiffness.
+    Sheet(Springs<T>, T),
     /// A mesh: its places; a spring of length 1 with the reference k, of which those of the mesh are multiples;
     /// the factor of the extra anchor stiffness; and the factor of the growth of a volume.
     Mesh(Arc<MeshPlaces>, SpringCoefficients<T>, T, f64),
@@ -65,9 +66,17 @@ impl<T: Real> Elastic<T> {
         point: [usize; 2],
     ) -> [T; 3] {
         match self {
-            Elastic::Sheet(springs) => {
-                let first = SHEET_ENDS * (point[0] * layout.columns + point[1]);
-                springs.gather(layout, u, point, |number| severed.has(first + number))
+            Elastic::Sheet(springs, pull) => {
+                let place = point[0] * layout.columns + point[1];
+                let first = SHEET_ENDS * place;
+                let mut force = springs.gather(layout, u, point, |number| severed.has(first + number));
+                if severed.anchor_count() > 0 {
+                    let pull = Scalar(*pull * T::of(severed.extra_anchor(0.0, place)));
+                    for c in 0..3 {
+                        force[c] = Scalar(force[c]).minus(pull, Scalar(u[c * layout.plane + layout.offset(place)])).0;
+                    }
+                }
+                force
             }
             Elastic::Solid(places, law, load) => {
                 let copies = severed.copies().map(|copies| &**copies);
@@ -110,7 +119,10 @@ impl<T: Real> SingleWork for Gathering<'_, T> {
 pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
     let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
     match &model.places {
-        Places::Sheet(_) => Elastic::Sheet(Springs::new(&model.scene.springs, model.prestrain, unit)),
+        Places::Sheet(_) => Elastic::Sheet(
+            Springs::new(&model.scene.springs, model.prestrain, unit),
+            T::of(unit * model.scene.anchor_stiffness_n_per_m),
+        ),
         Places::Solid(places) => {
             let (stiffness, [shear, lame]) = (unit * model.scene.springs.stiffness_n_per_m, places.lame_over_youngs());
             let load = PointLoad::new(places, unit, unit * model.scene.point_mass_kg() / model.unit_m);
@@ -209,7 +221,8 @@ impl<T: Real> SweepTables<T> {
         if let Some(solid) = &self.solid {
             return [solid.masses.as_ptr(), std::ptr::null()];
         }
-        self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
+        let of_sheet = [std::ptr::null(), self.cuts.anchors()];
+        self.mesh.as_ref().map_or(of_sheet, |mesh| mesh.springs.masses_and_extra())
     }
 
     /// Severs a spring. Returns the corners that this doubles, if the spring was whole.
@@ -247,8 +260,11 @@ impl<T: Real> SweepTables<T> {
         let [whole, severed] = self.severed.replace(model, cuts);
         whole.iter().for_each(|spring| self.set_spring(model, spring, false));
         severed.iter().for_each(|spring| self.set_spring(model, spring, true));
-        if let (Places::Surface(places), Some(mesh), 0) = (&model.places, &mut self.mesh, cuts.anchor_count()) {
-            mesh.springs.forget_anchors(&places.slots);
+        if cuts.anchor_count() == 0 {
+            self.cuts.forget_anchors();
+            if let (Places::Surface(places), Some(mesh)) = (&model.places, &mut self.mesh) {
+                mesh.springs.forget_anchors(&places.slots);
+            }
         }
         let copies = self.severed.copies().cloned();
         if let (Some(solid), Some(places)) = (&mut self.solid, model.places.solid()) {
@@ -283,7 +299,7 @@ impl<T: Real> SweepTables<T> {
         [gathered, u]: [f64; 2],
     ) -> f64 {
         let force_n = gathered / spring_unit;
-        if !model.places.differ() {
+        if !model.places.differ() && self.severed.anchor_count() == 0 {
             return force_n;
         }
         // Anchor stiffness beyond the reference K″ is not part of the springs.
@@ -296,6 +312,9 @@ impl<T: Real> SweepTables<T> {
         let [first, second] = spring.ends.map(|place| place as usize);
         let number = spring.number as usize;
         match (&model.places, &mut self.mesh) {
+            (Places::Sheet(_), _) if spring.is_anchor() => {
+                self.cuts.set_anchor(&self.layout, model.point_of(first), is_severed);
+            }
             (Places::Sheet(_), _) => {
                 let by = ENDS[number / 4][number % 4];
                 self.cuts.set(&self.layout, model.point_of(first), by, is_severed);
@@ -408,10 +427,10 @@ impl<T: Real> SweepTables<T> {
                 // SAFETY: the caller's promise; the springs and the snapshot were made for these slots and this width.
                 unsafe { lanes::run(self.width, &MeshSweep { grid, over, stage }) };
             }
-            (Elastic::Sheet(springs), _) => {
+            (Elastic::Sheet(springs, pull), _) => {
                 let mut carry = self.carry.borrow_mut();
                 debug_assert!(carry.len() == 3 * layout.plane);
-                let grid = Grid { layout, springs, cuts: &self.cuts, x, carry: carry.as_mut_ptr() };
+                let grid = Grid { layout, springs, cuts: &self.cuts, pull: *pull, x, carry: carry.as_mut_ptr() };
                 // SAFETY: the caller's promise.
                 unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
             }

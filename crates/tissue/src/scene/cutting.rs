@@ -25,7 +25,7 @@ pub struct Cutting {
     /// the strain ahead of a notch grows with 1/√distance (linear fracture mechanics), so that a notch in a finer mesh opens
     /// under the same load. `None`: all springs tear at the same strain.
     pub tear_reference_m: Option<f64>,
-    /// The length of the anchor springs of a surface at rest, m: so far beneath each point its anchor is attached to what bears the
+    /// The length of the anchor springs of a sheet or surface at rest, m: so far beneath each point its anchor is attached to what bears the
     /// tissue. A blade that crosses the line between both severs the anchor. `None`: nothing severs anchors.
     pub anchor_depth_m: Option<f64>,
     /// The direction from the points to where their anchors are attached, of any length above 0. `None`: into the tissue, against
@@ -49,9 +49,9 @@ impl Cutting {
         })
     }
 
-    /// Checks the values; `has_surface` tells whether the tissue is a surface.
-    pub(super) fn check(&self, has_surface: bool) -> Result<()> {
-        self.check_anchors(has_surface)?;
+    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs.
+    pub(super) fn check(&self, has_anchors: bool) -> Result<()> {
+        self.check_anchors(has_anchors)?;
         not_negative("cutting.toughness_j_per_m2", self.toughness_j_per_m2)?;
         self.thickness_m.map_or(Ok(()), |thickness_m| positive("cutting.thickness_m", thickness_m).map(drop))?;
         if let Some(strain) = self.tear_strain {
@@ -66,10 +66,10 @@ impl Cutting {
         physical("cutting.tear_reference_m", reference_m).map(drop)
     }
 
-    fn check_anchors(&self, has_surface: bool) -> Result<()> {
+    fn check_anchors(&self, has_anchors: bool) -> Result<()> {
         if let Some(depth_m) = self.anchor_depth_m {
-            if !has_surface {
-                let message = "is for [mesh]: only the anchor springs of a surface can be severed";
+            if !has_anchors {
+                let message = "is for [sheet] and [mesh]: a solid has no anchor springs";
                 return Err(Refusal::new(Reason::WrongKind, "cutting.anchor_depth_m", message));
             }
             physical("cutting.anchor_depth_m", depth_m)?;

@@ -569,7 +569,7 @@ impl Scene {
             return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
         }
         self.check_pretension()?;
-        self.cutting.check(matches!(self.body, Body::Mesh(_)))?;
+        self.cutting.check(!matches!(self.body, Body::Solid(_)))?;
         self.check_integrator()?;
         self.stepping.check(limits)?;
         if let Some(tolerance) = self.sleep_tolerance {

@@ -1,5 +1,6 @@
-//! The severed springs of a sheet as its sweep reads them: factors of 0 and 1, for rows with cuts only.
+//! The severed springs of a sheet as its sweep reads them: factors of 0 and 1, for rows with cuts only, and the anchors that are left.
 
+use crate::body::severed::NO_ANCHOR;
 use crate::kernel::field::{Field, Layout};
 use crate::kernel::real::Real;
 
@@ -21,12 +22,14 @@ pub(crate) struct SheetCuts<T> {
     stride: usize,
     /// For each row with cuts the factors of its springs, [`SPRINGS`] rows of the layout. Empty if no row has any.
     rows: Vec<Option<Box<Field<T>>>>,
+    /// The extra K″/m of each point divided by the reference value, a plane of the layout. `None` if no anchor spring is severed.
+    anchors: Option<Field<T>>,
 }
 
 impl<T: Real> SheetCuts<T> {
     /// Returns the factors of a whole sheet.
     pub(crate) fn none(layout: &Layout) -> Self {
-        SheetCuts { stride: layout.stride, rows: Vec::new() }
+        SheetCuts { stride: layout.stride, rows: Vec::new(), anchors: None }
     }
 
     /// Returns whether no row has cuts.
@@ -41,6 +44,23 @@ impl<T: Real> SheetCuts<T> {
             Some(Some(factors)) => factors.as_ptr(),
             _ => std::ptr::null(),
         }
+    }
+
+    /// Returns the extra K″/m of each point divided by the reference value; null if no anchor spring is severed.
+    #[inline(always)]
+    pub(crate) fn anchors(&self) -> *const T {
+        self.anchors.as_ref().map_or(std::ptr::null(), |anchors| anchors.as_ptr())
+    }
+
+    /// Severs or restores the anchor spring of a point.
+    pub(crate) fn set_anchor(&mut self, layout: &Layout, [i, j]: [usize; 2], is_severed: bool) {
+        let anchors = self.anchors.get_or_insert_with(|| Field::of_length(layout.plane));
+        anchors[i * self.stride + j] = T::of(if is_severed { NO_ANCHOR } else { 0.0 });
+    }
+
+    /// Forgets that anchor springs were severed, once all are whole again.
+    pub(crate) fn forget_anchors(&mut self) {
+        self.anchors = None;
     }
 
     /// Severs or restores the spring that joins the point [i, j] to the one `di` rows and `dj` columns on.

@@ -12,6 +12,8 @@ pub(crate) struct Grid<'a, T> {
     pub(crate) layout: Layout,
     pub(crate) springs: &'a Springs<T>,
     pub(crate) cuts: &'a SheetCuts<T>,
+    /// a = K″·dt²/m in the scheme's units of force: the factor of the extra anchor stiffness.
+    pub(crate) pull: T,
     /// Displacements: three planes, spacings.
     pub(crate) x: *const T,
     /// Forces that rows leave to those below: three planes of [`CARRY_ROWS`] rows.

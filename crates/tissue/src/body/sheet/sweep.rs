@@ -105,7 +105,8 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     // time. Others gave no time that could be measured: rows with fixed points, rows that are partly
                     // asleep, and springs that bend.
                     let (has_below, duty) = (i + 1 < rows, self.stage.duty(i));
-                    let is_plain = !self.grid.springs.is_tense() && self.grid.cuts.row(i).is_null();
+                    let is_cut = !self.grid.cuts.row(i).is_null() || !self.grid.cuts.anchors().is_null();
+                    let is_plain = !self.grid.springs.is_tense() && !is_cut;
                     if const { V::IS_REGISTER && !BENDING && !S::ENERGY } && has_below && whole && is_plain {
                         if duty == ROW_UNLOADED {
                             self.row::<V, BENDING, true, true, ROW_UNLOADED>(bending, i, span, &mut sums);
@@ -155,6 +156,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let span = if WHOLE { 0..columns.next_multiple_of(V::LANES) } else { span };
             // A row with cuts or a pretension is never swept as a whole one.
             let cuts = if WHOLE { std::ptr::null() } else { self.grid.cuts.row(i) };
+            let anchors = if WHOLE { std::ptr::null() } else { self.grid.cuts.anchors() };
             let mut column = span.start;
             while column < span.end {
                 let mask = if column + V::LANES < columns { full } else { tail };
@@ -303,6 +305,12 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                     if S::ENERGY && awake {
                         self.stage.energy(column, energy);
+                    }
+                }
+                if !WHOLE && !anchors.is_null() {
+                    let pull = zero.splat(self.grid.pull).mul(V::load(anchors.add(i * stride + column)));
+                    for c in 0..3 {
+                        n[c] = n[c].minus(pull, here[c]);
                     }
                 }
                 if awake {

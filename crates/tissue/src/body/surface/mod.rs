@@ -40,7 +40,7 @@ mod tests;
 
 pub use crate::scene::graph::{GraphFault, MeshGraph, MeshSpring};
 pub use mesh_calibration::MeshTrial;
-pub(crate) use pack::{MeshSprings, NO_ANCHOR};
+pub(crate) use pack::MeshSprings;
 pub(crate) use places::{MeshPlaces, VolumePlaces};
 pub use slots::{MeshSlots, NO_VERTEX};
 pub(crate) use sweep::{MeshGrid, MeshSweep, Snapshot, gather};

@@ -16,6 +16,7 @@ use palpate_geometry::work::spend;
 
 use super::order::TABLES;
 use super::slots::{HALO, HalfSpring, MeshSlots, part};
+use crate::body::severed::NO_ANCHOR;
 use crate::kernel::field::{BLOCK, Field};
 use crate::kernel::lanes::{LaneShape, Names, record_place};
 use crate::kernel::real::Real;
@@ -23,9 +24,6 @@ use crate::memory;
 
 /// Number of coefficients of a spring.
 pub(super) const COEFFICIENTS: usize = 5;
-
-/// The extra K″/m of a slot without an anchor spring, divided by the reference value.
-pub(crate) const NO_ANCHOR: f64 = -1.0;
 
 /// Which of them is the stiffness, the last.
 const STIFFNESS: usize = 4;

@@ -1,4 +1,4 @@
-//! The anchor springs of a surface that blades sever, so that the tissue comes free of its bed.
+//! The anchor springs of a sheet or surface that blades sever, so that the tissue comes free of its bed.
 //!
 //! With `[cutting] anchor_depth_m` an anchor spring is a line: from its point, wherever that is now, to the place at which it is
 //! attached, so far beneath the point's rest position. That place belongs to the bed and never moves. A blade severs the anchors whose
