@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use palpate_fitting::curve_file::{MeasuredCurve, UsualTip, read_curves};
-use palpate_fitting::fit::{FitOptions, fit as fit_curves};
+use palpate_fitting::fit::fit as fit_curves;
+use palpate_fitting::options::FitOptions;
 use palpate_haptics::TipShape;
 use palpate_session::press::ImposedPress;
 use palpate_tissue::files;

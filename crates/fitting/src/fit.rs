@@ -8,21 +8,20 @@
 //! otherwise it keeps the value of the scene, and the others are fitted again.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use nalgebra::{DMatrix, DVector};
 use palpate_refusal::{Reason, Refusal};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::Model;
-use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::tissue_parameter::TissueParameter;
 use palpate_tissue::scene::{Named, Scene};
 
 use super::curve_file::MeasuredCurve;
-use super::parallel::in_parallel;
+use super::options::{FitOptions, FitProgress};
+use super::runs::{Runs, residuals, rms};
 use super::scale::Scale;
 use super::search::{Minimum, minimize};
-use super::uncertainty::Uncertainty;
+use super::uncertainty::{MeasuredSamples, Uncertainty};
 
 /// The part of the largest force by which runs err at least: the noise of a measurement counts as no smaller.
 const RUNS_ERR: f64 = 1e-3;
@@ -32,23 +31,14 @@ const RUNS_ERR: f64 = 1e-3;
 const MULTIPLES: [f64; 3] = [4.0, 40.0, 400.0];
 const SEEN: f64 = 0.02;
 
-/// How many times the substeps of the given scene a run may have: a stiffer or more viscous tissue is not looked at.
-const MAX_SLOWER: u32 = 32;
+/// What runs err by is this many times what changes with half the substeps: it falls in proportion to their length at least.
+const FINER: f64 = 2.0;
+
+/// The part of an interval from which on a warning names the error of runs in it.
+const NAMED: f64 = 0.5;
 
 /// A correlation from which two parameters are named as told only together.
 const TOGETHER: f64 = 0.95;
-
-/// What to fit, and how.
-pub struct FitOptions<'o> {
-    /// The parameters; empty for those that the scene has, above 0, and the data can tell.
-    pub parameters: &'o [TissueParameter],
-    /// Threads of runs, at least 1. Without effect on the result.
-    pub threads: usize,
-    /// Limits of the runs.
-    pub limits: &'o Limits,
-    /// Ends the fit soon after another thread sets it.
-    pub stop: &'o AtomicBool,
-}
 
 /// A fitted parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -105,15 +95,6 @@ pub struct Fit {
     pub warnings: Vec<String>,
 }
 
-/// How far a fit is.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FitProgress {
-    /// Curves that were run so far.
-    pub runs: u64,
-    /// The smallest residual so far, N (root of the mean square); `None` before the first.
-    pub rms_n: Option<f64>,
-}
-
 /// What is fitted now: a parameter, where it began, and its scale.
 #[derive(Debug, Clone, Copy)]
 struct Active {
@@ -123,15 +104,9 @@ struct Active {
 }
 
 struct Fitter<'f> {
-    model: &'f Arc<Model>,
-    curves: &'f [MeasuredCurve],
-    options: &'f FitOptions<'f>,
-    measured: Vec<f64>,
+    runs: Runs<'f>,
     /// The scene with the values of what is not fitted.
     scene: Scene,
-    progress: &'f mut dyn FnMut(FitProgress),
-    runs: u64,
-    rms_n: Option<f64>,
 }
 
 /// Fits parameters of the scene of `model` to curves. The sums of squares and the intervals are those of equal, independent errors of
@@ -174,7 +149,8 @@ pub fn fit(
     if measured.iter().all(|force_n| *force_n == 0.0) {
         return Err(Refusal::new(Reason::OutOfRange, "force_n", "is 0 in all samples").into());
     }
-    Fitter { model, curves, options, measured, scene, progress, runs: 0, rms_n: None }.fit(active)
+    let runs = Runs { model, curves, options, measured, progress, count: 0, rms_n: None, no_forces: None };
+    Fitter { runs, scene }.fit(active)
 }
 
 impl Fitter<'_> {
@@ -187,11 +163,11 @@ impl Fitter<'_> {
             let is_untold =
                 |index: &usize| active[*index].scale.is_too_wide(minimum.x[*index], uncertainty.half_widths[*index]);
             let Some(last) = (0..active.len()).rev().find(is_untold) else {
-                return Ok(self.finish(&original, &active, &minimum, uncertainty, untold));
+                return self.finish(&original, &active, &minimum, uncertainty, untold);
             };
             let parameter = active[last].parameter;
             let reason = reason(&active, last, &minimum, &uncertainty);
-            if !self.options.parameters.is_empty() {
+            if !self.runs.options.parameters.is_empty() {
                 return Err(Refusal::new(Reason::Missing, parameter.name(), reason).into());
             }
             untold.push(UntoldParameter { parameter, value: parameter.value(&original).unwrap_or(0.0), reason });
@@ -208,55 +184,15 @@ impl Fitter<'_> {
         }
     }
 
-    /// Runs all curves with other values of the parameters. `None` where the tissue can't be stepped, or does not bear the presses.
-    fn predict(&mut self, active: &[Active], places: &[Vec<f64>]) -> Result<Vec<Option<Vec<f64>>>, SimulationFailure> {
-        let FitOptions { threads, limits, stop, .. } = *self.options;
-        // A value that no tissue has, such as the time of a branch below a millisecond, has no forces.
-        let scenes: Vec<Option<Scene>> = places.iter().map(|x| self.scene_at(active, x).ok()).collect();
-        let most = self.model.plan.substeps.saturating_mul(MAX_SLOWER).min(limits.substeps);
-        let narrower = Limits { substeps: most, ..limits.clone() };
-        let compile = |number: usize| scenes[number].as_ref().map(|scene| self.model.compile_alike(scene, &narrower));
-        let models = in_parallel(threads, scenes.len(), compile, || {});
-        let models = models.into_iter().map(|model| match model {
-            Some(None) => Ok(None),
-            Some(Some(Err(refusal))) if [Reason::TooLarge, Reason::OutOfRange].contains(&refusal.reason) => Ok(None),
-            Some(Some(model)) => model.map(Some),
-            None => Err(no_threads()),
-        });
-        let models = models.collect::<Result<Vec<Option<Arc<Model>>>, Refusal>>()?;
-        let curves = self.curves;
-        let run = |job: usize| {
-            let model = models[job / curves.len()].as_ref();
-            model.map(|model| curves[job % curves.len()].press.forces_n(model, limits, stop))
-        };
-        let (runs, rms_n, progress) = (&mut self.runs, self.rms_n, &mut self.progress);
-        let forces = in_parallel(threads, models.len() * curves.len(), run, || {
-            *runs += 1;
-            progress(FitProgress { runs: *runs, rms_n });
-        });
-        let mut predicted = Vec::with_capacity(places.len());
-        for of_curves in forces.chunks(curves.len()) {
-            let mut joined = Some(Vec::with_capacity(self.measured.len()));
-            for forces_n in of_curves {
-                match forces_n {
-                    None => return Err(no_threads().into()),
-                    Some(Some(Ok(forces_n))) => {
-                        if let Some(joined) = &mut joined {
-                            joined.extend_from_slice(forces_n);
-                        }
-                    }
-                    Some(None | Some(Err(SimulationFailure::Held(_)))) => joined = None,
-                    Some(Some(Err(SimulationFailure::Refused(refusal)))) => return Err(refusal.clone().into()),
-                    Some(Some(Err(SimulationFailure::Output(_)))) => joined = None,
-                }
-            }
-            if let Some(joined) = &joined {
-                let rms_n = rms(&residuals(joined, &self.measured));
-                self.rms_n = Some(self.rms_n.map_or(rms_n, |before| before.min(rms_n)));
-            }
-            predicted.push(joined);
-        }
-        Ok(predicted)
+    /// Runs all curves with other values of the parameters, stepped as at `at` ([`Runs::forces`]).
+    fn predict(
+        &mut self,
+        active: &[Active],
+        at: &[f64],
+        places: &[Vec<f64>],
+    ) -> Result<Vec<Option<Vec<f64>>>, SimulationFailure> {
+        let scenes = places.iter().map(|x| self.scene_at(active, x)).collect();
+        self.runs.forces(&self.scene_at(active, at), scenes)
     }
 
     fn scene_at(&self, active: &[Active], x: &[f64]) -> Result<Scene, Refusal> {
@@ -277,9 +213,11 @@ impl Fitter<'_> {
         if moving.is_empty() && !is_stiffness_open {
             return Ok(active);
         }
-        let Some(here) = self.predict(&active, &[vec![0.0; active.len()]])?.pop().flatten() else {
-            let message = "the tissue of the scene does not bear these presses: begin with a softer or less viscous one, or press less deep";
-            return Err(SimulationFailure::Held(message.to_owned()));
+        let begun = vec![0.0; active.len()];
+        let Some(here) = self.predict(&active, &begun, std::slice::from_ref(&begun))?.pop().flatten() else {
+            return Err(self.runs.held(
+                "the tissue of the scene does not bear these presses: begin with a softer or less viscous one, or press less deep",
+            ));
         };
         if here.iter().all(|force_n| *force_n == 0.0) {
             let message =
@@ -291,11 +229,11 @@ impl Fitter<'_> {
         let mut unseen: Vec<usize> = (0..moving.len()).collect();
         for multiple in MULTIPLES {
             let place = |unseen: &usize| {
-                let mut x = vec![0.0; active.len()];
+                let mut x = begun.clone();
                 x[moving[*unseen]] = multiple.ln();
                 x
             };
-            let predicted = self.predict(&active, &unseen.iter().map(place).collect::<Vec<_>>())?;
+            let predicted = self.predict(&active, &begun, &unseen.iter().map(place).collect::<Vec<_>>())?;
             let tried = std::mem::take(&mut unseen);
             for (number, more) in tried.into_iter().zip(predicted) {
                 let Some(more) = more else { continue };
@@ -311,7 +249,7 @@ impl Fitter<'_> {
         let columns = DMatrix::from_fn(here.len(), 1 + moving.len(), |row, column| {
             if column == 0 { elastic(row) } else { adds[column - 1][row] }
         });
-        let Some(factors) = least_squares(&columns, &self.measured, is_stiffness_open) else { return Ok(active) };
+        let Some(factors) = least_squares(&columns, &self.runs.measured, is_stiffness_open) else { return Ok(active) };
         if factors[0] <= 0.0 {
             let message = "does not grow with the depth: the force of the tissue on the tip must be above 0, outward";
             return Err(Refusal::new(Reason::OutOfRange, "force_n", message).into());
@@ -328,17 +266,23 @@ impl Fitter<'_> {
     }
 
     fn minimum(&mut self, active: &[Active]) -> Result<(Minimum, Uncertainty), SimulationFailure> {
-        let steps: Vec<[f64; 2]> = active.iter().map(|active| active.scale.step(active.parameter)).collect();
-        let measured = self.measured.clone();
-        let lengths: Vec<usize> = self.curves.iter().map(|curve| curve.force_n.len()).collect();
-        let found = minimize(&measured, &steps, &mut |places: &[Vec<f64>]| self.predict(active, places))?;
+        let steps: Vec<_> = active.iter().map(|active| active.scale.steps(active.parameter)).collect();
+        let measured = self.runs.measured.clone();
+        let lengths: Vec<usize> = self.runs.curves.iter().map(|curve| curve.force_n.len()).collect();
+        let found =
+            minimize(&measured, &steps, &mut |at: &[f64], places: &[Vec<f64>]| self.predict(active, at, places))?;
         let Some(minimum) = found else {
-            let message = "the tissue does not bear these presses where the search begins: a part of its stiffness may follow from something else";
-            return Err(SimulationFailure::Held(message.to_owned()));
+            return Err(self.runs.held(
+                "the tissue does not bear these presses where the search begins: a part of its stiffness may follow from something else",
+            ));
         };
+        let finer = self.runs.finer(&self.scene_at(active, &minimum.x)?)?;
+        let runs_err = finer.map(|finer| residuals(&finer, &minimum.predicted));
+        let runs_err: Option<Vec<f64>> = runs_err.map(|err| err.iter().map(|err| FINER * err).collect());
         let largest_n = measured.iter().fold(0.0_f64, |largest, force_n| largest.max(force_n.abs()));
         let residuals = residuals(&minimum.predicted, &measured);
-        let uncertainty = Uncertainty::of(&minimum.jacobian, &residuals, &lengths, RUNS_ERR * largest_n);
+        let data = MeasuredSamples { residuals: &residuals, lengths: &lengths, least_noise: RUNS_ERR * largest_n };
+        let uncertainty = Uncertainty::of(&minimum.jacobian, &data, runs_err.as_deref());
         Ok((minimum, uncertainty))
     }
 
@@ -350,8 +294,8 @@ impl Fitter<'_> {
         minimum: &Minimum,
         uncertainty: Uncertainty,
         untold: Vec<UntoldParameter>,
-    ) -> Fit {
-        let Fitter { curves, measured, runs, .. } = &self;
+    ) -> Result<Fit, SimulationFailure> {
+        let Runs { curves, measured, count, .. } = &self.runs;
         let all = residuals(&minimum.predicted, measured);
         let (mut fitted_n, mut rms_of_curves_n, mut begin) = (Vec::new(), Vec::new(), 0);
         for curve in *curves {
@@ -387,8 +331,9 @@ impl Fitter<'_> {
                 ((1.0 + r) / (1.0 - r)).sqrt()
             ));
         }
-        Fit {
-            scene: self.scene_at(active, &minimum.x).unwrap_or_else(|_| original.clone()),
+        warnings.extend(errors_of_runs(active, &uncertainty));
+        Ok(Fit {
+            scene: self.scene_at(active, &minimum.x)?,
             parameters: active.iter().enumerate().map(parameter).collect(),
             untold,
             correlations: uncertainty.correlations,
@@ -399,23 +344,28 @@ impl Fitter<'_> {
             r_squared: if spread > 0.0 { 1.0 - squares / spread } else { 0.0 },
             noise_n: uncertainty.noise,
             autocorrelation: uncertainty.autocorrelation,
-            runs: *runs,
+            runs: *count,
             warnings,
-        }
+        })
     }
 }
 
-fn no_threads() -> Refusal {
-    Refusal::new(Reason::NotAvailable, "", "no thread could be started")
-}
-
-fn residuals(predicted: &[f64], measured: &[f64]) -> Vec<f64> {
-    predicted.iter().zip(measured).map(|(predicted, measured)| predicted - measured).collect()
-}
-
-#[allow(clippy::cast_precision_loss)]
-fn rms(values: &[f64]) -> f64 {
-    (values.iter().map(|value| value * value).sum::<f64>() / values.len().max(1) as f64).sqrt()
+/// Returns a warning if runs err by much beside the noise, or nobody knows by how much.
+fn errors_of_runs(active: &[Active], uncertainty: &Uncertainty) -> Option<String> {
+    let Some(shifts) = &uncertainty.shifts else {
+        return Some(
+            "no run with shorter substeps was possible: the intervals are without what the runs err by".to_owned(),
+        );
+    };
+    let parts = shifts.iter().zip(&uncertainty.half_widths).map(|(shift, half_width)| shift / half_width);
+    let (index, part) = parts.enumerate().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    (part > NAMED).then(|| {
+        format!(
+            "{:.0} % of the interval of {} is what runs err by, and not noise: set a smaller stepping.tolerance",
+            100.0 * part,
+            active[index].parameter.name()
+        )
+    })
 }
 
 /// Returns the factors of the columns whose sum is nearest to `measured`; that of the first is 1 unless it is open. `None` if there is
@@ -448,7 +398,9 @@ fn reason(active: &[Active], index: usize, minimum: &Minimum, uncertainty: &Unce
             correlation(*a).total_cmp(&correlation(*b))
         })
         .filter(|other| uncertainty.correlations[index][*other].abs() > TOGETHER);
-    let interval = if half_width.is_finite() {
+    let interval = if half_width.is_nan() {
+        "the tissues beside the fitted one have no forces".to_owned()
+    } else if half_width.is_finite() {
         let [low, high] = [x - half_width, x + half_width].map(|x| scale.value(x));
         format!("its 95 % interval is {low:.3e} to {high:.3e} {}", parameter.unit())
     } else {

@@ -5,7 +5,9 @@
 
 pub mod curve_file;
 pub mod fit;
+pub mod options;
 mod parallel;
+mod runs;
 pub mod scale;
 pub mod scene_text;
 mod search;

@@ -37,18 +37,18 @@ impl Scale {
         }
     }
 
-    /// Returns the difference of x by which a search differentiates a parameter, toward the softer tissue, which takes no more
-    /// substeps; and what the difference of the forces is divided by. Forces are nearly proportional to a value that is above 0, or
-    /// linear in it: then d/dx is the difference divided by eʰ − 1, however large the step h is. It is large where a parameter adds
-    /// little to the force, so that the difference does not drown in the errors of runs.
-    pub fn step(&self, parameter: TissueParameter) -> [f64; 2] {
-        let step = match (self, parameter) {
-            (Scale::Poisson(_), _) => return [-0.1; 2],
-            (_, TissueParameter::BranchTime(_)) => return [-0.2; 2],
-            _ if parameter.adds_by_motion() => -0.2,
-            _ => -0.03,
+    /// Returns the differences of x by which a search differentiates a parameter, each with what the difference of the forces is divided
+    /// by: first toward the softer tissue, which takes no more substeps, then the other way, for where that tissue has no forces. Forces
+    /// are nearly proportional to a value that is above 0, or linear in it: then d/dx is the difference divided by eʰ − 1, however large
+    /// the step h is. It is large enough that the difference does not drown in the errors of runs.
+    pub fn steps(&self, parameter: TissueParameter) -> [[f64; 2]; 2] {
+        let step: f64 = match parameter {
+            _ if parameter.adds_by_motion() => 0.2,
+            TissueParameter::BranchTime(_) => 0.2,
+            _ => 0.1,
         };
-        [step, f64::exp_m1(step)]
+        let divisor = |step: f64| if matches!(self, Scale::Poisson(_)) { step } else { step.exp_m1() };
+        [-step, step].map(|step| [step, divisor(step)])
     }
 
     /// Returns whether an interval of the values is too wide to say anything: more than a factor of two up and down, and of

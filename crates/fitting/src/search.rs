@@ -24,8 +24,9 @@ const STEP_BOUND: f64 = 1.5;
 /// The Jacobian of the last step stands for that of the minimum if the numbers differ by no more.
 const SAME: f64 = 0.02;
 
-/// Evaluates the function at several places at once; `None` where it has no value.
-pub(crate) type Predict<'p, E> = dyn FnMut(&[Vec<f64>]) -> Result<Vec<Option<Vec<f64>>>, E> + 'p;
+/// Evaluates the function at several places at once, in the way in which it is evaluated at the first argument; `None` where it has no
+/// value.
+pub(crate) type Predict<'p, E> = dyn FnMut(&[f64], &[Vec<f64>]) -> Result<Vec<Option<Vec<f64>>>, E> + 'p;
 
 /// The result of a search.
 pub(crate) struct Minimum {
@@ -33,7 +34,7 @@ pub(crate) struct Minimum {
     pub(crate) x: Vec<f64>,
     /// The function there.
     pub(crate) predicted: Vec<f64>,
-    /// Its derivatives there, a column for each number.
+    /// Its derivatives there, a column for each number; NaN where it has no value on either side.
     pub(crate) jacobian: DMatrix<f64>,
     /// Whether the search ended because nothing becomes better.
     pub(crate) converged: bool,
@@ -43,7 +44,7 @@ struct Problem<'p, 'm, E> {
     measured: &'m [f64],
     /// The square root of the sum of its squares: residuals are relative to it.
     norm: f64,
-    steps: &'m [[f64; 2]],
+    steps: &'m [[[f64; 2]; 2]],
     x: DVector<f64>,
     predicted: Option<Vec<f64>>,
     predict: RefCell<&'m mut Predict<'p, E>>,
@@ -55,7 +56,7 @@ struct Problem<'p, 'm, E> {
 impl<E> Problem<'_, '_, E> {
     fn call(&self, places: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
         if self.failure.borrow().is_none() {
-            match (self.predict.borrow_mut())(places) {
+            match (self.predict.borrow_mut())(self.x.as_slice(), places) {
                 Ok(values) => return values,
                 Err(failure) => *self.failure.borrow_mut() = Some(failure),
             }
@@ -63,20 +64,31 @@ impl<E> Problem<'_, '_, E> {
         vec![None; places.len()]
     }
 
-    /// Returns the derivatives at the present place by differences; 0 where there is no value beside it.
+    /// Returns the derivatives at the present place by differences, to the other side where there is no value on the first one; NaN where
+    /// there is none on either.
     fn derivatives(&self) -> Option<DMatrix<f64>> {
         let here = self.predicted.as_ref()?;
-        let beside = |(number, [step, _]): (usize, &[f64; 2])| {
-            let mut place = self.x.as_slice().to_vec();
-            place[number] += step;
-            place
-        };
-        let values = self.call(&self.steps.iter().enumerate().map(beside).collect::<Vec<_>>());
-        let mut jacobian = DMatrix::zeros(here.len(), self.steps.len());
-        for (number, (value, [_, divisor])) in values.iter().zip(self.steps).enumerate() {
-            let Some(value) = value else { continue };
-            for (row, (beside, here)) in value.iter().zip(here).enumerate() {
-                jacobian[(row, number)] = (beside - here) / divisor;
+        let mut jacobian = DMatrix::from_element(here.len(), self.steps.len(), f64::NAN);
+        let mut missing: Vec<usize> = (0..self.steps.len()).collect();
+        for side in 0..2 {
+            let beside = |number: &usize| {
+                let mut place = self.x.as_slice().to_vec();
+                place[*number] += self.steps[*number][side][0];
+                place
+            };
+            let values = if missing.is_empty() {
+                Vec::new()
+            } else {
+                self.call(&missing.iter().map(beside).collect::<Vec<_>>())
+            };
+            for (number, value) in std::mem::take(&mut missing).into_iter().zip(values) {
+                let Some(value) = value else {
+                    missing.push(number);
+                    continue;
+                };
+                for (row, (beside, here)) in value.iter().zip(here).enumerate() {
+                    jacobian[(row, number)] = (beside - here) / self.steps[number][side][1];
+                }
             }
         }
         *self.newest.borrow_mut() = Some((self.x.clone(), jacobian.clone()));
@@ -116,19 +128,21 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
     }
 
     fn jacobian(&self) -> Option<DMatrix<f64>> {
-        self.derivatives().map(|jacobian| jacobian / self.norm)
+        // A number without a derivative stays where it is.
+        let known = |value: f64| if value.is_nan() { 0.0 } else { value / self.norm };
+        self.derivatives().map(|jacobian| jacobian.map(known))
     }
 }
 
 /// Searches from 0 on for the numbers with the least sum of squares of `predict` − `measured`, which is not 0 throughout. `steps` are
-/// the difference by which it differentiates each number, and what it divides the difference of the function by. Without numbers it evaluates once. `None` if the function has no
-/// value at 0.
+/// the two differences, one to each side, by which it differentiates each number, each with what it divides the difference of the function
+/// by. Without numbers it evaluates once. `None` if the function has no value at 0.
 ///
 /// # Errors
 /// Returns the error of `predict`.
 pub(crate) fn minimize<E>(
     measured: &[f64],
-    steps: &[[f64; 2]],
+    steps: &[[[f64; 2]; 2]],
     predict: &mut Predict<'_, E>,
 ) -> Result<Option<Minimum>, E> {
     let norm = measured.iter().map(|value| value * value).sum::<f64>().sqrt();
@@ -168,18 +182,37 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
 
+    const STEPS: [[f64; 2]; 2] = [[-0.01; 2], [0.01; 2]];
+
     #[test]
     fn an_exponential_is_found_from_far_away_and_places_without_a_value_are_left() {
         let times: Vec<f64> = (0..40).map(|k| 0.1 * f64::from(k)).collect();
         let curve = |x: &[f64]| times.iter().map(|t| x[0].exp() * (-t * x[1].exp()).exp()).collect::<Vec<f64>>();
         let mut evaluations = 0;
-        let mut predict = |places: &[Vec<f64>]| {
+        let mut predict = |_: &[f64], places: &[Vec<f64>]| {
             evaluations += places.len();
             Ok::<_, ()>(places.iter().map(|x| (x[0] < 3.0).then(|| curve(x))).collect())
         };
-        let found = minimize(&curve(&[2.5, -0.7]), &[[-0.01; 2]; 2], &mut predict).unwrap().unwrap();
+        let found = minimize(&curve(&[2.5, -0.7]), &[STEPS; 2], &mut predict).unwrap().unwrap();
         assert!(found.converged);
         assert!((found.x[0] - 2.5).abs() < 1e-3 && (found.x[1] + 0.7).abs() < 1e-3, "{:?}", found.x);
         assert!(evaluations < 60, "{evaluations}");
+    }
+
+    /// A derivative of 0 would say that the function does not depend on the number.
+    #[test]
+    fn a_number_with_a_value_on_one_side_has_a_derivative_and_one_without_neighbours_has_none() {
+        let begun = [0.0, 0.0];
+        let mut predict = |at: &[f64], places: &[Vec<f64>]| {
+            let value = |x: &Vec<f64>| {
+                let is_alone = x[1] != at[1];
+                (x[0] >= begun[0] && !is_alone).then(|| (0..5).map(|k| 2.0 + x[0] + x[1] + f64::from(k)).collect())
+            };
+            Ok::<_, ()>(places.iter().map(value).collect())
+        };
+        let measured: Vec<f64> = (0..5).map(|k| 2.5 + f64::from(k)).collect();
+        let found = minimize(&measured, &[STEPS; 2], &mut predict).unwrap().unwrap();
+        assert!((found.x[0] - 0.5).abs() < 1e-6 && found.x[1] == 0.0, "{:?}", found.x);
+        assert!((found.jacobian[(0, 0)] - 1.0).abs() < 1e-9 && found.jacobian[(0, 1)].is_nan(), "{}", found.jacobian);
     }
 }

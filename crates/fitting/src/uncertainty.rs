@@ -1,6 +1,6 @@
 //! How well data tell numbers: intervals and correlations from the residuals and the Jacobian at a minimum.
 
-use nalgebra::{DMatrix, SymmetricEigen};
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 /// Columns of the Jacobian that are parallel to within this have no common solution; it is the least eigenvalue of their
 /// correlations that counts.
@@ -12,8 +12,10 @@ const NOTICED: f64 = 3.0;
 /// How well data tell numbers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Uncertainty {
-    /// Half the width of the 95 % interval of each number; infinite if nothing depends on it.
+    /// Half the width of the 95 % interval of each number, with its shift; infinite if nothing depends on it, NaN if its column has NaN.
     pub half_widths: Vec<f64>,
+    /// How far each number is off because the function is not computed exactly, up or down; `None` if nobody knows.
+    pub shifts: Option<Vec<f64>>,
     /// Correlation between the errors of each two numbers, by rows.
     pub correlations: Vec<Vec<f64>>,
     /// Standard deviation of the noise, from the residuals.
@@ -53,17 +55,32 @@ fn autocorrelation(residuals: &[f64], lengths: &[usize]) -> f64 {
     if found * pairs.sqrt() > NOTICED { found.min(0.99) } else { 0.0 }
 }
 
+/// What is known of the data beside a Jacobian.
+#[derive(Debug, Clone, Copy)]
+pub struct MeasuredSamples<'d> {
+    /// Function − measured of each sample.
+    pub residuals: &'d [f64],
+    /// The number of samples of each curve, one after the other.
+    pub lengths: &'d [usize],
+    /// The noise is at least this: what the function errs by from place to place.
+    pub least_noise: f64,
+}
+
 impl Uncertainty {
-    /// Returns the uncertainty of the numbers of a minimum. `residuals` are of curves of these `lengths`, one after the other;
-    /// `jacobian` has a row for each and a column for each number. The noise is at least `least_noise`, with which the function
-    /// itself is computed.
+    /// Returns the uncertainty of the numbers of a minimum. `jacobian` has a row for each sample and a column for each number;
+    /// `errors` are the true function − the function there, if somebody knows it.
     #[allow(clippy::cast_precision_loss)]
-    pub fn of(jacobian: &DMatrix<f64>, residuals: &[f64], lengths: &[usize], least_noise: f64) -> Self {
+    pub fn of(jacobian: &DMatrix<f64>, data: &MeasuredSamples<'_>, errors: Option<&[f64]>) -> Self {
         let count = jacobian.ncols();
+        let residuals = data.residuals;
+        let is_known: Vec<bool> =
+            jacobian.column_iter().map(|column| !column.iter().any(|value| value.is_nan())).collect();
+        let jacobian =
+            DMatrix::from_fn(jacobian.nrows(), count, |i, j| if is_known[j] { jacobian[(i, j)] } else { 0.0 });
         let degrees = residuals.len().saturating_sub(count).max(1) as f64;
         let squares: f64 = residuals.iter().map(|residual| residual * residual).sum();
         let noise = (squares / degrees).sqrt();
-        let autocorrelation = autocorrelation(residuals, lengths);
+        let autocorrelation = autocorrelation(residuals, data.lengths);
         let dependence = ((1.0 + autocorrelation) / (1.0 - autocorrelation)).sqrt();
         let norms: Vec<f64> = jacobian.column_iter().map(|column| column.norm()).collect();
         let scaled = |column: usize, norm: f64| jacobian.column(column) / norm.max(f64::MIN_POSITIVE);
@@ -74,15 +91,27 @@ impl Uncertainty {
             let of = |k: usize| eigen.eigenvectors[(i, k)] * eigen.eigenvectors[(j, k)];
             (0..count).map(|k| of(k) / eigen.eigenvalues[k].max(MIN_EIGENVALUE)).sum::<f64>()
         });
-        let factor = student_t_95(degrees) * (noise * dependence).max(least_noise);
-        let half_width =
-            |i: usize| if norms[i] > 0.0 { factor * covariance[(i, i)].sqrt() / norms[i] } else { f64::INFINITY };
+        let shifts = errors.map(|errors| {
+            let errors = DVector::from_column_slice(errors);
+            let along: Vec<f64> = columns.iter().map(|column| column.dot(&errors)).collect();
+            let shift = |i: usize| (0..count).map(|j| covariance[(i, j)] * along[j]).sum::<f64>().abs();
+            (0..count).map(|i| if norms[i] > 0.0 { shift(i) / norms[i] } else { 0.0 }).collect::<Vec<f64>>()
+        });
+        let factor = student_t_95(degrees) * (noise * dependence).max(data.least_noise);
+        let half_width = |i: usize| match (is_known[i], norms[i] > 0.0) {
+            (false, _) => f64::NAN,
+            (true, false) => f64::INFINITY,
+            (true, true) => {
+                factor * covariance[(i, i)].sqrt() / norms[i] + shifts.as_ref().map_or(0.0, |shifts| shifts[i])
+            }
+        };
         let correlation = |i: usize, j: usize| {
             if i == j { 1.0 } else { covariance[(i, j)] / (covariance[(i, i)] * covariance[(j, j)]).sqrt() }
         };
         Uncertainty {
             half_widths: (0..count).map(half_width).collect(),
             correlations: (0..count).map(|i| (0..count).map(|j| correlation(i, j)).collect()).collect(),
+            shifts,
             noise,
             autocorrelation,
         }
@@ -91,6 +120,7 @@ impl Uncertainty {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
 
     #[test]
@@ -106,21 +136,39 @@ mod tests {
         let x: Vec<f64> = (0..50).map(|k| 0.1 * f64::from(k)).collect();
         let jacobian = DMatrix::from_fn(50, 2, |i, j| if j == 0 { 1.0 } else { x[i] });
         let alternating: Vec<f64> = (0..50).map(|k| if k % 2 == 0 { 0.1 } else { -0.1 }).collect();
-        let found = Uncertainty::of(&jacobian, &alternating, &[50], 0.0);
+        let of = |residuals: &[f64], errors: Option<&[f64]>| {
+            Uncertainty::of(&jacobian, &MeasuredSamples { residuals, lengths: &[50], least_noise: 0.0 }, errors)
+        };
+        let found = of(&alternating, None);
         let noise = (50.0 * 0.01_f64 / 48.0).sqrt();
         let mean = x.iter().sum::<f64>() / 50.0;
         let spread: f64 = x.iter().map(|x| (x - mean).powi(2)).sum();
         assert!((found.half_widths[1] / (student_t_95(48.0) * noise / spread.sqrt()) - 1.0).abs() < 1e-9);
         assert!(found.autocorrelation == 0.0 && found.correlations[0][1] < -0.8, "{found:?}");
         let drifting: Vec<f64> = x.iter().map(|x| 0.1 * (x - mean).signum()).collect();
-        let drifted = Uncertainty::of(&jacobian, &drifting, &[50], 0.0);
+        let drifted = of(&drifting, None);
         assert!(drifted.half_widths[1] > 3.0 * found.half_widths[1], "{drifted:?}");
+        // A function that is lower than the true one by a line of a known slope is fitted with that slope too much.
+        let errors: Vec<f64> = x.iter().map(|x| 0.3 + 0.02 * x).collect();
+        let shifted = of(&alternating, Some(&errors));
+        let shifts = shifted.shifts.clone().unwrap();
+        assert!((shifts[0] - 0.3).abs() < 1e-9 && (shifts[1] - 0.02).abs() < 1e-9, "{shifts:?}");
+        assert!((shifted.half_widths[1] - found.half_widths[1] - 0.02).abs() < 1e-9, "{shifted:?}");
     }
 
     #[test]
-    fn parallel_columns_and_columns_of_zeros_have_no_bounded_interval() {
-        let jacobian = DMatrix::from_fn(20, 3, |i, j| if j == 2 { 0.0 } else { (j + 1) as f64 * (i + 1) as f64 });
-        let found = Uncertainty::of(&jacobian, &[0.0; 20], &[20], 0.01);
+    fn parallel_columns_and_columns_of_zeros_have_no_bounded_interval_and_those_of_nan_none() {
+        let jacobian = DMatrix::from_fn(20, 4, |i, j| match j {
+            2 => 0.0,
+            3 => f64::NAN,
+            _ => (j + 1) as f64 * (i + 1) as f64,
+        });
+        let found = Uncertainty::of(
+            &jacobian,
+            &MeasuredSamples { residuals: &[0.0; 20], lengths: &[20], least_noise: 0.01 },
+            None,
+        );
         assert!(found.half_widths[0] > 1.0 && found.half_widths[2].is_infinite(), "{found:?}");
+        assert!(found.half_widths[3].is_nan() && found.half_widths[0].is_finite(), "{found:?}");
     }
 }

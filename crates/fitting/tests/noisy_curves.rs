@@ -7,7 +7,8 @@ use std::time::Instant;
 
 use fastrand::Rng;
 use palpate_fitting::curve_file::MeasuredCurve;
-use palpate_fitting::fit::{Fit, FitOptions, fit};
+use palpate_fitting::fit::{Fit, fit};
+use palpate_fitting::options::FitOptions;
 use palpate_haptics::TipShape;
 use palpate_session::press::ImposedPress;
 use palpate_session::simulation::SimulationFailure;
@@ -33,12 +34,11 @@ fn ramp(shape: TipShape, radius_m: f64, depth_m: f64, [into_s, holds_s, every_s]
     ImposedPress { place_m: None, shape, radius_m, time_s, depth_m }
 }
 
-/// A press that vibrates about a depth, from 0 to twice that.
-fn vibration(shape: TipShape, radius_m: f64, depth_m: f64, frequency_hz: f64, lasts_s: f64) -> ImposedPress {
-    let samples = (lasts_s * 1000.0).round() as usize;
-    let time_s: Vec<f64> = (0..=samples).map(|k| 0.001 * k as f64).collect();
+/// A press that vibrates about a depth by an amplitude.
+fn vibration(shape: TipShape, radius_m: f64, [depth_m, amplitude_m]: [f64; 2], frequency_hz: f64) -> ImposedPress {
+    let time_s: Vec<f64> = (0..=100).map(|k| 0.001 * k as f64).collect();
     let turn = |time_s: &f64| (std::f64::consts::TAU * frequency_hz * time_s).cos();
-    let depth_m = time_s.iter().map(|time_s| depth_m * (1.0 - turn(time_s))).collect();
+    let depth_m = time_s.iter().map(|time_s| depth_m - amplitude_m * turn(time_s)).collect();
     ImposedPress { place_m: None, shape, radius_m, time_s, depth_m }
 }
 
@@ -83,10 +83,11 @@ impl Case {
         fit(&self.start, &self.curves(seed), &options, &mut |_| {})
     }
 
-    /// Fits `seeds` noises; prints how often each parameter is within its interval, and its largest error, and returns the least
-    /// share.
-    fn recover(&self, what: &str, seeds: u64) -> (f64, f64) {
+    /// Fits `seeds` noises; prints how often each parameter is within its interval, its largest error. Returns the least share, and the largest error of `of`.
+    fn recover(&self, what: &str, of: TissueParameter, seeds: u64) -> (f64, f64) {
         let begun = Instant::now();
+        let mut parameters = self.parameters.clone();
+        parameters.sort_by_key(|of| TissueParameter::NAMES.iter().position(|entry| entry.1 == *of));
         let (mut within, mut worst, mut width) = (vec![0_u32; 8], vec![0.0_f64; 8], vec![0.0_f64; 8]);
         let mut runs = 0;
         for seed in 0..seeds {
@@ -100,8 +101,6 @@ impl Case {
                 width[index] = width[index].max((high - low) / 2.0 / truth);
             }
         }
-        let mut parameters = self.parameters.clone();
-        parameters.sort_by_key(|of| TissueParameter::NAMES.iter().position(|entry| entry.1 == *of));
         for (index, parameter) in parameters.iter().enumerate() {
             println!(
                 "{what} {}: {} of {seeds} within the interval, largest error {:.2} %, interval up to ±{:.2} %",
@@ -119,7 +118,8 @@ impl Case {
             runs / seeds
         );
         let least = within[..parameters.len()].iter().min().unwrap();
-        (f64::from(*least) / seeds as f64, worst[0])
+        let of = parameters.iter().position(|parameter| *parameter == of).unwrap();
+        (f64::from(*least) / seeds as f64, worst[of])
     }
 }
 
@@ -135,17 +135,31 @@ fn sheet() -> Case {
     let presses = vec![
         ramp(TipShape::Disc, 0.005, 0.008, [0.1, 0.0, 0.001]),
         ramp(TipShape::Disc, 0.015, 0.008, [0.1, 0.0, 0.001]),
-        vibration(TipShape::Disc, 0.010, 0.002, 20.0, 0.1),
+        vibration(TipShape::Disc, 0.010, [0.003, 0.002], 20.0),
     ];
     Case::new(truth, presses, &[(P::SpringStiffness, 0.4), (P::AnchorStiffness, 2.0), (P::Damping, 3.0)])
 }
 
+/// A capsule on a foundation, which carries most of a touch: the curves tell E of the capsule weakly.
+fn surface() -> Case {
+    let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.003, seed = 1 }\n[material]\nyoungs_modulus_pa = 85e3\n\
+                thickness_m = 0.002\nfoundation_n_per_m3 = 1.34e6\ndamping_ratio = 0.5\n[stepping]\ntolerance = 1e-3\n";
+    let truth = Scene::parse("surface", text, &[], &Limits::default()).unwrap();
+    let presses = vec![
+        ramp(TipShape::Disc, 0.005, 0.005, [0.1, 0.0, 0.001]),
+        ramp(TipShape::Disc, 0.015, 0.005, [0.1, 0.0, 0.001]),
+        vibration(TipShape::Disc, 0.010, [0.003, 0.002], 20.0),
+    ];
+    Case::new(truth, presses, &[(P::YoungsModulus, 0.4), (P::Foundation, 2.0), (P::DampingRatio, 3.0)])
+}
+
+/// A block of silicone, 40 mm thick, under a small tip that goes in deep and one that is as wide as the block is thick.
 fn solid(cell: &str) -> Case {
     let truth = scene("phantom", &[cell, "material.viscosity_pa_s=5.0"]);
     let presses = vec![
-        ramp(TipShape::RigidDisc, 0.008, 0.003, [0.1, 0.0, 0.001]),
-        ramp(TipShape::RigidDisc, 0.025, 0.006, [0.1, 0.0, 0.001]),
-        vibration(TipShape::RigidDisc, 0.012, 0.001, 20.0, 0.1),
+        ramp(TipShape::RigidDisc, 0.008, 0.010, [0.1, 0.0, 0.001]),
+        ramp(TipShape::RigidDisc, 0.045, 0.003, [0.1, 0.0, 0.001]),
+        vibration(TipShape::RigidDisc, 0.045, [0.003, 0.001], 20.0),
     ];
     Case::new(truth, presses, &[(P::YoungsModulus, 0.3), (P::PoissonsRatio, 0.7), (P::Viscosity, 0.05)])
 }
@@ -161,29 +175,36 @@ fn the_stiffness_of_a_sheet_and_of_a_solid_is_given_back_within_its_interval() {
         ("sheet", scene("liver", &[]), on_sheet, (P::AnchorStiffness, 2.0)),
         ("solid", coarse, on_solid, (P::YoungsModulus, 0.3)),
     ] {
-        let (share, error) = Case::new(truth, presses, &[factor]).recover(what, 1);
+        let (share, error) = Case::new(truth, presses, &[factor]).recover(what, factor.0, 1);
         assert!(share == 1.0 && error < 0.03, "{what}: {share}, {error}");
     }
 }
 
-/// Fits 50 noises, and checks how often the truth is within the intervals: of stiffnesses as often as they say, of damping less often.
-fn recovered(what: &str, case: &Case) {
-    let (share, error) = case.recover(what, 50);
-    assert!(share >= 0.8 && error < 0.2, "{what}: {share}, {error}");
+/// Fits 50 noises, and checks how often the truth is within the 95 % intervals, and the largest error of a stiffness.
+fn recovered(what: &str, case: &Case, (of, largest): (TissueParameter, f64)) {
+    let (share, error) = case.recover(what, of, 50);
+    assert!(share >= 0.9 && error < largest, "{what}: {share}, {error}");
 }
 
 #[test]
 #[ignore = "takes minutes"]
-fn fifty_noises_of_a_sheet_are_within_the_intervals_nearly_as_often_as_these_say() {
+fn fifty_noises_of_a_sheet_are_within_the_intervals_as_often_as_these_say() {
     at_the_root();
-    recovered("sheet", &sheet());
+    recovered("sheet", &sheet(), (P::AnchorStiffness, 0.03));
 }
 
 #[test]
 #[ignore = "takes minutes"]
-fn fifty_noises_of_a_solid_are_within_the_intervals_nearly_as_often_as_these_say() {
+fn fifty_noises_of_a_surface_are_within_the_intervals_as_often_as_these_say() {
     at_the_root();
-    recovered("solid", &solid("solid.cell_m=0.013"));
+    recovered("surface", &surface(), (P::Foundation, 0.03));
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn fifty_noises_of_a_solid_are_within_the_intervals_as_often_as_these_say() {
+    at_the_root();
+    recovered("solid", &solid("solid.cell_m=0.013"), (P::YoungsModulus, 0.03));
 }
 
 #[test]
@@ -192,6 +213,6 @@ fn a_solid_of_3000_cells_is_given_back() {
     at_the_root();
     let case = solid("solid.cell_m=0.0055");
     println!("{:?} cells", case.truth.body.kind().cells());
-    let (share, error) = case.recover("solid of 3,000 cells", 1);
-    assert!(share > 0.0 && error < 0.1, "{share}, {error}");
+    let (share, error) = case.recover("solid of 3,000 cells", P::YoungsModulus, 1);
+    assert!(share > 0.0 && error < 0.03, "{share}, {error}");
 }

@@ -14,7 +14,10 @@ use palpate_tissue::{Footprint, Model};
 
 use super::simulation::{Simulation, SimulationFailure};
 
-/// Time in which a tip comes to the depth at which a press begins, and time for which it then rests there, s.
+/// Height above the tissue from which a tip comes to the depth at which a press begins, m; the time in which it does, and the time for
+/// which it then rests in the tissue, s. It arrives with a speed of 0: a tip that began at its first place would be dropped there from
+/// 2 mm above by the playback of poses, at 0.5 m/s, and the force of its impact would hide the first milliseconds of the press.
+const CLEARANCE_M: f64 = 0.002;
 const ARRIVES_S: f64 = 0.2;
 const RESTS_S: f64 = 0.3;
 
@@ -36,7 +39,7 @@ pub struct ImposedPress {
     /// Times, s, ascending. The first may be any: the tissue rests before it.
     pub time_s: Vec<f64>,
     /// Depth at each time, m, below 0 above the tissue: of a disc of even pressure the mean over it, of a sphere that of its lowest
-    /// place. A press that begins at a depth above 0 has come there in 0.2 s, and rested for 0.3 s.
+    /// place. A tip has come to the first depth in 0.2 s, and has rested for 0.3 s if that is above 0.
     pub depth_m: Vec<f64>,
 }
 
@@ -45,6 +48,24 @@ pub struct ImposedPress {
 pub(crate) fn on_surface(model: &Model, place_m: Option<DVec3>, radius_m: f64) -> (DVec3, DVec3) {
     let wanted_m = place_m.unwrap_or_else(|| model.shape().pressed_m());
     Footprint::new(model, radius_m, wanted_m).at_rest()
+}
+
+/// Returns the place of a tip that touches the surface at rest, m, on its way in at the place and against the direction that
+/// [`on_surface`] returns. A flat rigid disc touches the highest vertex beneath it: the mean of a face that it reaches beyond is
+/// lower, and there it would press from the beginning.
+fn touching_m(model: &Model, shape: TipShape, radius_m: f64, (place_m, outward): (DVec3, DVec3)) -> DVec3 {
+    let height_m = shape.height_m(radius_m);
+    if shape != TipShape::RigidDisc {
+        return place_m + height_m * outward;
+    }
+    let above_m = |vertex_m: &DVec3| {
+        let from_m = *vertex_m - place_m;
+        let up_m = from_m.dot(outward);
+        ((from_m - up_m * outward).length() <= radius_m && up_m <= radius_m).then_some(up_m)
+    };
+    let vertices_m = model.shape().shown_surface().map_or(&[][..], |shown| shown.vertices_m);
+    let highest_m = vertices_m.iter().filter_map(above_m).fold(0.0, f64::max);
+    place_m + (height_m + highest_m) * outward
 }
 
 impl ImposedPress {
@@ -98,7 +119,8 @@ impl ImposedPress {
 
     /// Returns the time before the first sample, s.
     fn lead_s(&self) -> f64 {
-        if self.depth_m.first().is_some_and(|depth_m| *depth_m > 0.0) { ARRIVES_S + RESTS_S } else { 0.0 }
+        let rests_s = if self.depth_m.first().is_some_and(|depth_m| *depth_m > 0.0) { RESTS_S } else { 0.0 };
+        ARRIVES_S + rests_s
     }
 
     /// Returns the depth at a time after the first sample, s, or before it while the tip arrives, m. `before` is the number of a
@@ -107,7 +129,8 @@ impl ImposedPress {
         let begins_m = self.depth_m.first().copied().unwrap_or(0.0);
         if time_s <= 0.0 {
             let part = ((time_s + self.lead_s()) / ARRIVES_S).clamp(0.0, 1.0);
-            return begins_m * (if self.lead_s() > 0.0 { part * part * (3.0 - 2.0 * part) } else { 1.0 });
+            let above_m = begins_m.min(0.0) - CLEARANCE_M;
+            return above_m + (begins_m - above_m) * (part * part * (3.0 - 2.0 * part));
         }
         let at_s = |index: usize| self.time_s[index] - self.time_s[0];
         while *before + 2 < self.time_s.len() && at_s(*before + 1) <= time_s {
@@ -131,8 +154,8 @@ impl ImposedPress {
         stop: &AtomicBool,
     ) -> std::result::Result<Vec<f64>, SimulationFailure> {
         self.check()?;
-        let (place_m, outward) = on_surface(model, self.place_m, self.radius_m);
-        let height_m = self.shape.height_m(self.radius_m);
+        let at_rest = on_surface(model, self.place_m, self.radius_m);
+        let (touching_m, outward) = (touching_m(model, self.shape, self.radius_m, at_rest), at_rest.1);
         let tip = Tip { shape: self.shape, radius_m: self.radius_m, friction: 0.0, ..Tip::default() };
         let (step_s, lead_s) = (model.scene.stepping.rate_hz.recip(), self.lead_s());
         let mut simulation = Simulation::new(model, limits);
@@ -143,8 +166,8 @@ impl ImposedPress {
                 return Err(given_up().into());
             }
             let ends_s = (step + 1) as f64 * step_s - lead_s;
-            let out_m = height_m - self.depth_at_m(ends_s, &mut before);
-            simulation.command(0, Action::Pose { place_m: place_m + out_m * outward, velocity_m_per_s: None, tip })?;
+            let place_m = touching_m - self.depth_at_m(ends_s, &mut before) * outward;
+            simulation.command(0, Action::Pose { place_m, velocity_m_per_s: None, tip })?;
             simulation.step(0)?;
             if let Some(reason) = simulation.session.fault() {
                 return Err(SimulationFailure::Held(reason));
@@ -191,6 +214,41 @@ mod tests {
         assert!((later_n[0] / (0.001 * slope(1, 10)) - 1.0).abs() < 0.02, "{later_n:?}");
         // Above the tissue there is no force.
         assert_eq!(press(-0.003)[..20], [0.0; 20]);
+    }
+
+    /// A tip that was dropped onto the tissue would be felt as 0 at first, and then as a knock.
+    #[test]
+    fn a_fast_press_that_begins_at_the_surface_meets_the_tissue_from_its_first_millisecond_on() {
+        let sets = ["sheet.points=[9, 9]", "springs.stiffness_n_per_m=0.0", "damping.coefficient_n_s_per_m=0.1"];
+        let model = Model::parse("paper", PAPER, &sets).unwrap();
+        let time_s: Vec<f64> = (0..=20).map(|k| 1e-3 * f64::from(k)).collect();
+        let depth_m = time_s.iter().map(|time_s| 0.1 * time_s).collect();
+        let press = ImposedPress { place_m: None, shape: TipShape::Disc, radius_m: 0.04, time_s, depth_m };
+        let forces_n = press.forces_n(&model, &Limits::default(), &AtomicBool::new(false)).unwrap();
+        // Anchor springs and damping at a constant speed: a straight line from the first sample after contact on.
+        let rise_n = (forces_n[20] - forces_n[1]) / 19.0;
+        for (k, pair) in forces_n.windows(2).enumerate().skip(1) {
+            assert!(((pair[1] - pair[0]) / rise_n - 1.0).abs() < 0.02, "{k}: {forces_n:?}");
+        }
+        assert!(forces_n[0].abs() < rise_n, "{forces_n:?}");
+    }
+
+    /// A plate that reaches beyond all of a face meets as much force as one that only just covers it, and none before it presses.
+    #[test]
+    fn a_plate_that_is_wider_than_the_specimen_touches_it_at_depth_0() {
+        let text = "[solid]\norgan = { name = \"phantom\", edge_m = 0.005, seed = 1 }\ncell_m = 0.02\nfixed = [{ plane_m = [0, 0, 0], \
+                    normal = [0, 0, 1], within_m = 0.001 }]\n[material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.4\n";
+        let model = Model::parse("block", text, &[]).unwrap();
+        let press = |radius_m| {
+            let time_s: Vec<f64> = (0..=10).map(|k| 0.02 * f64::from(k)).collect();
+            let depth_m = time_s.iter().map(|time_s| 0.005 * time_s).collect();
+            let press = ImposedPress { place_m: None, shape: TipShape::RigidDisc, radius_m, time_s, depth_m };
+            press.forces_n(&model, &Limits::default(), &AtomicBool::new(false)).unwrap()
+        };
+        let (covers_n, wider_n) = (press(0.071), press(0.09));
+        assert!(wider_n[0].abs() < 0.01 * wider_n[10], "{wider_n:?}");
+        assert!((wider_n[1] / wider_n[10] - 0.1).abs() < 0.03, "{wider_n:?}");
+        assert!((wider_n[10] / covers_n[10] - 1.0).abs() < 0.05, "{covers_n:?} {wider_n:?}");
     }
 
     #[test]

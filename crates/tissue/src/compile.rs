@@ -286,20 +286,17 @@ impl Model {
         Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
     }
 
-    /// Compiles another scene of the same points with the scheme and the number format of this model, without rehearsals, and with
-    /// the fewest substeps that are as short beside the fastest vibration as those of this model. So the force of a run depends
-    /// smoothly on the scene's coefficients. The expected error and the sleep tolerance are those of this model.
+    /// Returns the fewest substeps of another scene of the same points that are as short beside the fastest vibration as those of
+    /// this model, and stable.
     ///
     /// # Errors
-    /// Refuses every scene that [`Scene::check`] refuses, and more substeps than `limits.substeps`, which stability needs
-    /// ([`Reason::TooLarge`]).
+    /// Refuses every scene that [`Scene::check`] refuses.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub fn compile_alike(&self, scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+    pub fn substeps_alike(&self, scene: &Scene, limits: &Limits) -> Result<u32> {
         // Substeps may be that much longer, so that coefficients a little beyond those of this model have as many.
         const SLACK: f64 = 0.97;
         scene.check(limits)?;
-        let scene = scene.clone().with_unsigned_zeros();
-        let sheet = Oscillator::of(&scene);
+        let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
         let faster = SLACK * sheet.omega_bound_per_s() / self.omega_bound_per_s;
         let Plan { integrator, substeps, .. } = self.plan;
@@ -307,9 +304,35 @@ impl Model {
         while substeps <= limits.substeps && !Plan::new(integrator, substeps, step_s, &sheet).stable {
             substeps += 1 + substeps / 16;
         }
-        let choice = Choice { integrator, substeps, precision: self.precision, expected_error: self.expected_error };
+        Ok(substeps)
+    }
+
+    /// Compiles another scene of the same points with the scheme and the number format of this model, without rehearsals, and with
+    /// [`Model::substeps_alike`], at least `least_substeps`. The force of a run depends smoothly on the scene's coefficients as long
+    /// as the substeps stay the same. The expected error and the sleep tolerance are those of this model.
+    ///
+    /// # Errors
+    /// Refuses every scene that [`Scene::check`] refuses, and more substeps than `limits.substeps`, which stability needs
+    /// ([`Reason::TooLarge`]).
+    pub fn compile_alike(&self, scene: &Scene, least_substeps: u32, limits: &Limits) -> Result<Arc<Self>> {
+        let scene = scene.clone().with_unsigned_zeros();
+        let substeps = self.substeps_alike(&scene, limits)?.max(least_substeps);
+        let Model { precision, expected_error, .. } = *self;
+        let choice = Choice { integrator: self.plan.integrator, substeps, precision, expected_error };
         let model = Model::chosen(&scene, choice, 0, limits, &scheme_selection::NEVER)?;
         Ok(Arc::new(Model { sleep_tolerance: self.sleep_tolerance, ..Arc::unwrap_or_clone(model) }))
+    }
+
+    /// Compiles the scene of this model with its scheme, twice its substeps, in f64, and without sleep. What differs in a run of it shows
+    /// what a run of this model errs by.
+    ///
+    /// # Errors
+    /// Refuses more substeps than `limits.substeps` ([`Reason::TooLarge`]).
+    pub fn compile_finer(&self, limits: &Limits) -> Result<Arc<Self>> {
+        let (integrator, substeps) = (self.plan.integrator, self.plan.substeps.saturating_mul(2));
+        let choice = Choice { integrator, substeps, precision: Precision::F64, expected_error: self.expected_error };
+        let model = Model::chosen(&self.scene, choice, 0, limits, &scheme_selection::NEVER)?;
+        Ok(Arc::new(Model { sleep_tolerance: 0.0, ..Arc::unwrap_or_clone(model) }))
     }
 
     /// Compiles the models of successive changes, each with the step at which it applies. Each change builds on

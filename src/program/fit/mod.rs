@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use palpate_fitting::curve_file::{MeasuredCurve, UsualTip, read_curves};
-use palpate_fitting::fit::{Fit, FitOptions, FitProgress, fit};
+use palpate_fitting::fit::{Fit, fit};
+use palpate_fitting::options::{FitOptions, FitProgress};
 use palpate_fitting::scene_text::{rounded, with_values};
 use palpate_haptics::TipShape;
 use palpate_refusal::printable::printable;
