@@ -2,14 +2,16 @@
 //!
 //! No crate is used: `dicom-object` keeps all elements of a file, and is not bounded.
 
+mod frames;
+
 use glam::{DMat3, DVec3};
 
 use super::allowance::MemoryAllowance;
 use super::label_map::LabelMap;
 use super::source::{Order, Scalar, parsed, words};
-use super::voxels::{LabelRun, LabelSource, MAX_SIDE};
-use crate::work::spend;
+use super::voxels::MAX_SIDE;
 use crate::{Element, MeshError, Problem, Unit};
+use frames::{Frames, Values};
 
 /// Length of the part before the first element, which ends with the word `DICM`.
 const PREAMBLE: usize = 132;
@@ -335,79 +337,5 @@ impl<'a> Segmentation<'a> {
         }
         let voxels = Frames { sides, values, frames, pixels };
         Ok(LabelMap { voxels: Box::new(voxels), axes, origin, unit: Some(Unit::MILLIMETRE) })
-    }
-}
-
-/// How voxels tell their label.
-#[derive(Debug, Clone, Copy)]
-enum Values {
-    /// A bit, whether the voxel is in the segment of the frame.
-    Bits,
-    /// A byte, which part of the voxel is in it, relative to the largest: from one half.
-    Fractions(usize),
-    /// The label itself.
-    Labels(Scalar),
-}
-
-/// The voxels of frames, one after the other.
-struct Frames<'a> {
-    /// Columns and rows.
-    sides: [usize; 2],
-    values: Values,
-    /// The segment and the slice of each frame.
-    frames: Vec<(i64, usize)>,
-    pixels: &'a [u8],
-}
-
-impl Frames<'_> {
-    /// Returns the label of a voxel by its number in the file.
-    fn label(&self, segment: i64, number: usize) -> i64 {
-        let byte = |at: usize| self.pixels.get(at).copied().unwrap_or(0);
-        let is_in = match self.values {
-            Values::Bits => byte(number / 8) >> (number % 8) & 1 == 1,
-            Values::Fractions(largest) => 2 * usize::from(byte(number)) >= largest,
-            Values::Labels(scalar) => {
-                let at = number * scalar.size();
-                return self.pixels.get(at..).map_or(0, |bytes| scalar.integer(bytes, Order::Little));
-            }
-        };
-        if is_in { segment } else { 0 }
-    }
-}
-
-impl LabelSource for Frames<'_> {
-    fn runs(
-        &self,
-        _: &mut MemoryAllowance<'_>,
-        visit: &mut dyn FnMut(LabelRun) -> Result<(), Problem>,
-    ) -> Result<(), Problem> {
-        let [columns, rows] = self.sides;
-        let voxels = columns.saturating_mul(rows).saturating_mul(self.frames.len());
-        let bytes = match self.values {
-            Values::Bits => voxels.div_ceil(8),
-            Values::Fractions(_) => voxels,
-            Values::Labels(scalar) => voxels.saturating_mul(scalar.size()),
-        };
-        if self.pixels.len() < bytes {
-            return Err(Problem::Truncated { missing: "a part of the voxels".to_owned() });
-        }
-        for (number, (segment, z)) in self.frames.iter().enumerate() {
-            for y in 0..rows {
-                spend(columns);
-                let row = (number * rows + y) * columns;
-                let mut x = 0;
-                while x < columns {
-                    let first = x;
-                    let label = self.label(*segment, row + x);
-                    while x < columns && self.label(*segment, row + x) == label {
-                        x += 1;
-                    }
-                    if label != 0 {
-                        visit((label, [first, y, *z], x - first))?;
-                    }
-                }
-            }
-        }
-        Ok(())
     }
 }
