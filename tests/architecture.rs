@@ -32,7 +32,7 @@ const MODULES: [(&str, &[&str]); 6] = [
         ],
     ),
     ("crates/exercise", &["*"]),
-    ("crates/fitting", &["parallel", "search", "uncertainty", "*", "fit"]),
+    ("crates/fitting", &["parallel", "search", "uncertainty", "*", "runs", "fit"]),
     ("crates/session", &["budget", "*", "surface", "wire", "journal"]),
     ("crates/realtime", &["priority", "ids", "*"]),
     (".", &["server", "render"]),
