@@ -80,7 +80,7 @@ impl Snapshot {
     }
 
     /// Returns the displacements of the vertices that frames of `grid` show, m.
-    fn displacement_m(&self, grid: Refinement) -> &[Vec<f32>; 3] {
+    pub(super) fn displacement_m(&self, grid: Refinement) -> &[Vec<f32>; 3] {
         let [rows, columns] = self.points;
         match &self.skin {
             None => &self.displacement_m,

@@ -341,7 +341,7 @@ pub(super) mod tests {
             let bytes = frame.patches.iter().flat_map(|patch| patch.bytes.as_chunks::<12>().0);
             for (index, bytes) in bytes.enumerate() {
                 let [a, b] = [index / grid.vertices()[1], index % grid.vertices()[1]];
-                for (c, values) in snapshot.displacement_m().iter().enumerate() {
+                for (c, values) in snapshot.displacement_m(grid).iter().enumerate() {
                     let at = |i: usize| {
                         let (left, right) = (values[i * 17 + b / cells], values[i * 17 + b.div_ceil(cells)]);
                         left + (b % cells) as f32 / cells as f32 * (right - left)
@@ -380,7 +380,7 @@ pub(super) mod tests {
             let (held, place) = (first.patches[0].bytes.clone(), first.patches[1].bytes.as_ptr());
             let before = held.to_vec();
             let moved =
-                snapshot().displacement_m().each_ref().map(|values| values.iter().map(|v| 1.0 - 2.0 * v).collect());
+                snapshot().displacement_m(grid).each_ref().map(|values| values.iter().map(|v| 1.0 - 2.0 * v).collect());
             let moved = Snapshot::new(&scene([31, 17]), 8, 0.008, moved);
             let second = encode_over(&moved, first);
             assert_eq!((second.patches[1].bytes.as_ptr(), held), (place, before.into()));
