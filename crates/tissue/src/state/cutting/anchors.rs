@@ -12,6 +12,7 @@ use glam::DVec3;
 use super::{Crossing, EdgeSweep};
 use crate::body::severed::{ANCHOR, SeveredSpring};
 use crate::body::spring_ends::SpringEnd;
+use crate::body::spring_search::NearTile;
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
 use crate::state::tissue_state::TissueState;
@@ -27,10 +28,9 @@ impl<T: Real> TissueState<T> {
         let [least_m, most_m] = sweep.bounds_m();
         let reach_m = DVec3::splat(depth_m);
         let around_m = [least_m - reach_m, most_m + reach_m];
-        let near =
-            (0..tiles.tile_count()).filter(|tile| search.touches(model, layout, state, &tiles.moved, *tile, around_m));
         let mut found = Vec::new();
-        let places = near.flat_map(|tile| {
+        let near = search.near(model, layout, state, &tiles.moved, around_m);
+        let places = near.into_iter().flat_map(|NearTile { tile, .. }| {
             let [rows, columns] = sides_of(layout, tile);
             rows.flat_map(move |i| columns.clone().map(move |j| i * across + j))
         });
