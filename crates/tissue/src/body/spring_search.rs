@@ -97,8 +97,9 @@ impl<T: Real> SingleWork for Near<'_, T> {
                     if !touches || (below | above).test(c) != apart {
                         continue;
                     }
-                    let most = |sign: T| largest(layout, &u[c * layout.plane..], tile, sign).wide();
-                    (displaced[0][c], displaced[1][c]) = (-most(T::of(-1.0)), most(T::of(1.0)));
+                    // No closure: it would not get the instructions of its caller.
+                    let [least, most] = range(layout, &u[c * layout.plane..], tile);
+                    (displaced[0][c], displaced[1][c]) = (least.wide(), most.wide());
                     touches = high_m[c] + unit_m * displaced[1][c] >= least_m[c]
                         && low_m[c] + unit_m * displaced[0][c] <= most_m[c];
                 }
@@ -111,22 +112,28 @@ impl<T: Real> SingleWork for Near<'_, T> {
     }
 }
 
-/// Returns the largest value in a tile of a plane, times 1 or −1; at least 0.
+/// Returns the least and the largest value in a tile of a plane, both with 0.
 #[inline(always)]
-fn largest<T: Real>(layout: &Layout, plane: &[T], tile: usize, sign: T) -> T {
+fn range<T: Real>(layout: &Layout, plane: &[T], tile: usize) -> [T; 2] {
     let [rows, columns] = sides_of(layout, tile);
     // A lane for each column: only then does the compiler compare a row at once.
-    let mut most = [T::default(); TILE];
+    let (mut least, mut most) = ([T::default(); TILE], [T::default(); TILE]);
     for i in rows {
-        let row = &plane[i * layout.stride..][columns.clone()];
-        let most = &mut most[..row.len()];
+        let row = &plane[i * layout.stride..][columns.start..columns.end];
+        let (least, most) = (&mut least[..row.len()], &mut most[..row.len()]);
         // Not zipped: the compiler calls a function for each row then.
         for lane in 0..row.len() {
-            let value = sign * row[lane];
+            let value = row[lane];
+            least[lane] = if value < least[lane] { value } else { least[lane] };
             most[lane] = if value > most[lane] { value } else { most[lane] };
         }
     }
-    most.into_iter().fold(T::default(), |most, value| if value > most { value } else { most })
+    let (mut low, mut high) = (T::default(), T::default());
+    for lane in 0..TILE {
+        low = if least[lane] < low { least[lane] } else { low };
+        high = if most[lane] > high { most[lane] } else { high };
+    }
+    [low, high]
 }
 
 /// Returns the places of a tile.

@@ -245,8 +245,8 @@ impl SolidPlaces {
     pub(crate) fn cube_across(&self, cube: usize, axis: usize, is_higher: bool) -> Option<usize> {
         let [x, y, _] = self.corners;
         let by = [1, x, x * y][axis];
-        let at = self.shape.corner_at(cube)[axis];
-        let other = if is_higher { cube + by } else { (at > 0).then(|| cube - by)? };
+        let is_first = || self.shape.corner_at(cube)[axis] == 0;
+        let other = if is_higher { cube + by } else { (!is_first()).then(|| cube - by)? };
         // Beyond the last cube of a row there is a corner without one.
         (self.weight(cube) > 0.0 && self.weight(other) > 0.0).then_some(other)
     }

@@ -350,8 +350,9 @@ impl SolidShape {
 
     /// Returns the rest position of the corner of a number, m.
     pub(crate) fn corner_m(&self, number: usize) -> DVec3 {
-        let corner = self.corner_at(number).map(|at| at as f64);
-        self.lattice.origin_m + self.lattice.edge_m * DVec3::from_array(corner)
+        // Not mapped: the compiler does not always inline that.
+        let [i, j, k] = self.corner_at(number);
+        self.lattice.origin_m + self.lattice.edge_m * DVec3::new(i as f64, j as f64, k as f64)
     }
 
     /// Returns the point at each corner (the number of none where there is none), and the corner of each point.
@@ -368,7 +369,8 @@ impl SolidShape {
     /// Returns the corner of a number.
     #[inline(always)]
     pub(crate) fn corner_at(&self, number: usize) -> [usize; 3] {
-        let [x, y, _] = self.lattice.cells.map(|cells| cells + 1);
+        let [x, y, _] = self.lattice.cells;
+        let (x, y) = (x + 1, y + 1);
         [number % x, number / x % y, number / x / y]
     }
 
