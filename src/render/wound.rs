@@ -10,6 +10,9 @@ use palpate_tissue::CutSurface;
 /// How far beneath the surface the dark tissue is drawn, as a fraction of the distance of neighbouring points.
 const DEPTH: f64 = 0.5;
 
+/// The dark tissue is not drawn where it would be stretched to this many distances of points: there the pieces are apart.
+const MAX_STRETCH: f64 = 4.0;
+
 /// Opens a wound in a whole surface. `rest_m` returns the rest position of a vertex, m, and neighbouring points are `edge_m` apart.
 pub(super) fn open_wound(surface: &mut DrawnSurface, wound: &Wound, rest_m: impl Fn(usize) -> DVec3, edge_m: f64) {
     let sunk_m = |corner: usize| surface.vertices[corner].at_m - DEPTH * edge_m * surface.vertices[corner].normal;
@@ -17,7 +20,10 @@ pub(super) fn open_wound(surface: &mut DrawnSurface, wound: &Wound, rest_m: impl
         cut.first as usize..cut.first as usize + cut.count as usize
     };
     let covered = wound.triangles.iter().flat_map(hidden).filter_map(|number| surface.triangles.get(number));
-    let bed_m = covered.map(|corners| corners.map(sunk_m)).collect();
+    let is_whole = |[a, b, c]: &[DVec3; 3]| {
+        [a.distance(*b), b.distance(*c), c.distance(*a)].into_iter().all(|side_m| side_m < MAX_STRETCH * edge_m)
+    };
+    let bed_m = covered.map(|corners| corners.map(sunk_m)).filter(is_whole).collect();
     for lip in &wound.vertices {
         let vertex = lip_vertex(lip, &surface.vertices, &rest_m);
         surface.vertices.push(vertex);

@@ -12,6 +12,8 @@ export const CUTS_PER_PICTURE = 512;
 export const MAX_SLOTS = 1 << 16;
 /** Depth of the tissue between the lips, in distances of mass points. */
 const DEPTH = 0.5;
+/** Lips that are farther apart than this, in distances of mass points, belong to pieces: no tissue is between them. */
+const APART = 4;
 /** How much darker a lip is than the surface. */
 const LIP_LIGHT = 0.62;
 /** Initial numbers of vertices and triangles; they double when they do not suffice. */
@@ -203,14 +205,17 @@ export class ShownWound {
       const isLip = secondPart !== 0 || thirdPart !== 0 || host !== second;
       const h = surface.drawnVertex(host);
       const ends = thirdPart === 0 ? [host, second] : [host, second, third];
+      const moved = (vertex: number, c: number) => position[3 * surface.drawnVertex(vertex) + c]! - surface.restOf(vertex, c);
+      const apart = (vertex: number) => Math.hypot(...[0, 1, 2].map((c) => moved(vertex, c) - moved(host, c)));
+      const bedEnds = isLip && Math.max(...ends.map(apart)) > APART * surface.pointsApartM ? [host] : ends;
       for (let c = 0; c < 3; c++) {
         const hostM = surface.restOf(host, c);
         const restM = hostM + secondPart * (surface.restOf(second, c) - hostM) + (thirdPart === 0 ? 0 : thirdPart * (surface.restOf(third, c) - hostM));
         ownPosition[3 * slot + c] = restM + position[3 * h + c]! - hostM;
         ownNormal[3 * slot + c] = normal[3 * h + c]!;
         let movedM = 0;
-        for (const end of ends) movedM += position[3 * surface.drawnVertex(end) + c]! - surface.restOf(end, c);
-        bedPosition[3 * slot + c] = restM + movedM / ends.length - depthM * normal[3 * h + c]!;
+        for (const end of bedEnds) movedM += moved(end, c);
+        bedPosition[3 * slot + c] = restM + movedM / bedEnds.length - depthM * normal[3 * h + c]!;
       }
       const light = isLip ? LIP_LIGHT : 1;
       ownOpen[slot] = light * open[h]!;
