@@ -251,7 +251,13 @@ fn an_exercise_is_judged_by_its_truth_and_another_seed_hides_something_else() {
     ] {
         says(palpate(folder.path(), &["check", "liver", "--exercise", exercise]), 2, &[part]);
     }
-    says(palpate(folder.path(), &["check", "liver", "--exercise", "lumps-1"]), 2, &["exercise lumps-1", "inclusion"]);
+    says(
+        palpate(folder.path(), &["check", "liver", "--exercise", "lumps-1"]),
+        2,
+        &["exercise lumps-1", "does not fit", "inclusion"],
+    );
+    let valid = palpate(folder.path(), &["check", "phantom", "--exercise", "lumps-1", "--seed", "7"]);
+    says(valid, 0, &["exercise      lumps-1, valid: ", "with seed 7", "120 s", "criteria"]);
     says(palpate(folder.path(), &["check", "fibrotic", "--exercise", "cut-line"]), 0, &["made for liver"]);
 }
 

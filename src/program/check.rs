@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use palpate_refusal::printable::printable_lines;
 use palpate_session::check;
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::exercise_judge::ExerciseJudge;
 use palpate_tissue::Model;
 use palpate_tissue::scene::collection::find_script;
@@ -57,6 +58,21 @@ fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
     Some(format!("none of vertices = {} in [mesh] makes a step much cheaper", tried.join(", ")))
 }
 
+/// Describes a valid exercise in a line.
+fn exercise_row(chosen: &ChosenExercise) -> String {
+    let ChosenExercise { exercise, lumps, seed, .. } = chosen;
+    let of = |count: usize, one: &str| format!("{count} {one}{}", if count == 1 { "" } else { "s" });
+    let mut parts = vec![format!("{} with seed {seed}", of(lumps.len(), "lump"))];
+    parts.extend(exercise.time_limit_s.map(|limit_s| format!("{limit_s} s")));
+    parts.extend(exercise.force_limit_n.map(|limit_n| format!("{limit_n} N")));
+    let weight: f64 = exercise.criteria.iter().map(|criterion| criterion.weight).sum();
+    parts.push(format!(
+        "{} of weight {weight} in all",
+        of(exercise.criteria.len(), "criterion").replace("criterions", "criteria")
+    ));
+    format!("exercise      {}, valid: {}\n", exercise.name, parts.join(", "))
+}
+
 /// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
@@ -68,9 +84,10 @@ pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     for warning in script.iter().flat_map(|script| &script.warnings) {
         say!("palpate: warning: {warning}");
     }
+    let of_exercise = chosen.as_ref().map_or(String::new(), exercise_row);
     let report = check::check(&model, script.as_ref(), &limits, &clock_s);
     let advice = advice(&arguments.scene, &model).map_or(String::new(), |advice| format!("\nadvice: {advice}\n"));
-    match write!(std::io::stdout(), "{}", printable_lines(format_args!("{report}{advice}"))) {
+    match write!(std::io::stdout(), "{}", printable_lines(format_args!("{of_exercise}{report}{advice}"))) {
         // A reader that closed the pipe is not an error.
         Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(e.to_string())),
         _ => Ok(()),

@@ -3,7 +3,8 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use palpate_refusal::{Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::exercise_judge::check_criteria;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::scene::collection::Collection;
@@ -67,13 +68,28 @@ impl Catalog {
         self.scripts.names_where(&self.scenes, limits, |_, text| fits(text, scene))
     }
 
-    /// Returns the valid exercises, sorted by name.
+    /// Returns the valid exercises, sorted by the name of their files.
     pub fn exercises(&self, limits: &Limits) -> Vec<Exercise> {
-        let read = |name: &String| {
-            let (file, text) = self.exercise_text(name, limits).ok()?;
-            Exercise::parse(&file, &text).ok()
+        self.all_exercises(limits).filter_map(Result::ok).collect()
+    }
+
+    /// Returns a refusal for each invalid exercise, sorted by the name of its file: the list leaves it out.
+    pub fn invalid_exercises(&self, limits: &Limits) -> Vec<Refusal> {
+        self.all_exercises(limits).filter_map(Result::err).collect()
+    }
+
+    fn all_exercises(&self, limits: &Limits) -> impl Iterator<Item = Result<Exercise>> {
+        let read = move |name: String| {
+            let (file, text) = self.exercise_text(&name, limits)?;
+            let exercise = Exercise::parse(&file, &text)?;
+            check_criteria(&exercise)?;
+            if exercise.name != name {
+                let message = format!("is `{}`, but clients ask for the name of the file, `{name}`", exercise.name);
+                return Err(Refusal { place: Some(file), ..Refusal::new(Reason::WrongKind, "name", message) });
+            }
+            Ok(exercise)
         };
-        self.exercises.names(limits).iter().filter_map(read).collect()
+        self.exercises.names(limits).into_iter().map(read)
     }
 
     /// Returns the text of the exercise named `name`, and the name of its file for refusals.

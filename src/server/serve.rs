@@ -133,6 +133,9 @@ async fn run(
             warn!(%refusal, "this scene is invalid: no session can be created from it");
         }
     }
+    for refusal in catalog.invalid_exercises(&config.limits) {
+        warn!(%refusal, "this exercise is invalid: it is left out of the list");
+    }
     for refusal in catalog.misplaced(&config.limits) {
         warn!(%refusal, "this file is left out of the list");
     }

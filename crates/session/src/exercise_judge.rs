@@ -65,9 +65,8 @@ impl ExerciseJudge {
     /// Refuses a criterion of a measure that does not exist or that this exercise does not have, places off the tissue, and a fixed
     /// place to lift.
     pub fn new(exercise: &Exercise, lumps: Vec<Lump>, model: &Model, begin_step: u64) -> Result<Self> {
-        check_criteria(exercise)
-            .and_then(|()| check_places(exercise, model.shape()))
-            .map_err(|refusal| within(exercise, refusal))?;
+        check_criteria(exercise)?;
+        check_places(exercise, model.shape()).map_err(|refusal| within(exercise, refusal))?;
         let avoided =
             exercise.avoid.iter().map(|ball| AvoidedBall { centre_m: ball.centre_m, radius_m: ball.radius_m });
         let lift = exercise.lift.map(|lift| LiftTarget { height_m: lift.height_m, hold_s: lift.hold_s });
@@ -208,8 +207,15 @@ fn within(exercise: &Exercise, refusal: Refusal) -> Refusal {
     Refusal { place: Some(format!("exercise {}", exercise.name)), ..refusal }
 }
 
+/// Checks the criteria of an exercise.
+///
+/// # Errors
 /// Refuses a criterion whose measure does not exist, or has no value in this exercise.
-fn check_criteria(exercise: &Exercise) -> Result<()> {
+pub fn check_criteria(exercise: &Exercise) -> Result<()> {
+    criteria(exercise).map_err(|refusal| within(exercise, refusal))
+}
+
+fn criteria(exercise: &Exercise) -> Result<()> {
     for (index, criterion) in exercise.criteria.iter().enumerate() {
         let name = criterion.measure.as_str();
         let field = format!("criterion[{index}].measure");

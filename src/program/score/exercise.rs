@@ -84,7 +84,12 @@ pub(crate) fn compile(
     let Some(chosen) = chosen else { return compile_with(scene, &[]) };
     let of_exercise = |failure: Failure| match failure {
         Failure::Refused(message) if message.contains("inclusion") => {
-            Failure::Refused(format!("exercise {}: {message}", chosen.exercise.name))
+            // The lumps that were drawn are in the scene's text: they are not the user's `--set`.
+            let message = message.replace("--set: ", "");
+            Failure::Refused(format!(
+                "exercise {}: a lump of seed {} does not fit this scene: {message}",
+                chosen.exercise.name, chosen.seed
+            ))
         }
         other => other,
     };

@@ -174,7 +174,7 @@ impl Skin {
             return Arc::default();
         }
         let kept = |kept: &(Cuts, Arc<CutSurface>)| kept.0.is_same(cuts).then(|| kept.1.clone());
-        let known = kept(&*lock(&self.cut_surface));
+        let known = kept(&lock(&self.cut_surface));
         known.unwrap_or_else(|| {
             // Not under the lock: another reader may be in a hurry.
             let surface = Arc::new(CutSurface::of(&self.model, cuts));

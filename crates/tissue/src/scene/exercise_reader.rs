@@ -116,6 +116,7 @@ fn range(fields: &mut Fields<'_>, key: &'static str, least: f64, most: f64) -> R
     let item = fields.required(key)?;
     let ends = match item.number() {
         Ok(value) => [value; 2],
+        Err(_) if item.list().is_err() => return Err(item.wrong("a whole number, or [least, most]")),
         Err(_) => match item.list()?.iter().map(Item::number).collect::<Result<Vec<_>>>()?.as_slice() {
             [least, most] => [*least, *most],
             _ => return Err(item.wrong("a number, or [least, most]")),
