@@ -395,6 +395,7 @@ fn scenes() -> Vec<pb::Scene> {
             depth_m: Some(0.02),
             foundation_n_per_m3: Some(4e5),
             damping_ratio: Some(0.5),
+            foundation_group: None,
         }),
         inclusions: vec![pb::Inclusion {
             centre_m: Some(pb::Vector3 { x: 0.0, y: 0.0, z: 0.03 }),

@@ -64,7 +64,7 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
     let of = |count: usize, one: &str| format!("{count} {one}{}", if count == 1 { "" } else { "s" });
     let mut parts = vec![format!("{} with seed {seed}", of(lumps.len(), "lump"))];
     parts.extend(exercise.time_limit_s.map(|limit_s| format!("{limit_s} s")));
-    parts.extend(exercise.force_limit_n.map(|limit_n| format!("{limit_n} N")));
+    parts.extend(exercise.limits.force_n.map(|limit_n| format!("{limit_n} N")));
     let weight: f64 = exercise.criteria.iter().map(|criterion| criterion.weight).sum();
     parts.push(format!(
         "{} of weight {weight} in all",
