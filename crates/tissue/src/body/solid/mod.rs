@@ -9,6 +9,7 @@
 
 pub(crate) mod corner_copies;
 pub(crate) mod cut_cubes;
+mod cut_plane;
 pub(crate) mod cut_surface;
 pub(crate) mod footprint;
 pub(crate) mod inversion;
