@@ -151,6 +151,21 @@ export function scenesToCut(pretensionNPerM = 0) {
   return folder;
 }
 
+/**
+ * Leads a blade that is in the tissue along a line, in small steps as a hand does: to and fro until it has severed more than so many springs. On a busy
+ * machine it comes later than the pointer, or begins anew on its way.
+ * @param {Page} page @param {[number, number]} from @param {[number, number]} to @param {number} severed
+ */
+export async function sweep(page, from, to, severed) {
+  for (let turn = 0; turn === 0 || (turn < 8 && (await page.ask(({ wound }) => wound)).severed <= severed); turn++) {
+    const [begin, end] = turn % 2 === 0 ? [from, to] : [to, from];
+    for (let k = 1; k <= 30; k++) {
+      await page.page.mouse.move(...(await page.at(begin[0] + ((end[0] - begin[0]) * k) / 30, begin[1] + ((end[1] - begin[1]) * k) / 30)));
+      await new Promise((done) => setTimeout(done, 40));
+    }
+  }
+}
+
 /** The tissue of most tests: a push moves it by centimetres. @param {Server} server */
 export const paper = ({ url }) => `${url}/?scene=paper`;
 

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { rmSync } from "node:fs";
 import { after, before, describe, test } from "node:test";
-import { cut, pages, scenesToCut, Server } from "./harness.mjs";
+import { cut, pages, scenesToCut, Server, sweep } from "./harness.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
@@ -26,13 +26,7 @@ async function cutMiddle(page) {
   await page.until(({ holds, hands }) => holds && hands.both[0]?.touches === true);
   const { sampledS } = await page.ask(({ sampledS }) => ({ sampledS }));
   await page.until(({ sampledS }, before) => sampledS > before + 1, sampledS);
-  // On a busy machine the blade comes later than the pointer, or begins anew on its way: then it goes to and fro.
-  for (let turn = 0; turn === 0 || (turn < 8 && (await page.ask(({ wound }) => wound)).severed <= 30); turn++) {
-    for (let k = 1; k <= 30; k++) {
-      await page.page.mouse.move(...(await page.at(0.485, turn % 2 === 0 ? 0.3 + 0.015 * k : 0.75 - 0.015 * k)));
-      await new Promise((done) => setTimeout(done, 40));
-    }
-  }
+  await sweep(page, [0.485, 0.3], [0.485, 0.75], 30);
   await page.until(({ wound }) => wound.severed > 30);
   await page.page.mouse.up();
   await page.page.keyboard.press("Escape");

@@ -5,7 +5,7 @@ import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { colourAt, pages, scenesToCut, Server } from "./harness.mjs";
+import { colourAt, pages, scenesToCut, Server, sweep } from "./harness.mjs";
 import { Hostile, SESSION } from "./hostile.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
@@ -31,15 +31,11 @@ async function sinks(page) {
   await page.until(({ sampledS }, before) => sampledS > before + 1, sampledS);
 }
 
-/** Drags from one place to another in small steps, as a hand does. @param {Page} page @param {[number, number]} from @param {[number, number]} to */
-async function drag(page, from, to) {
+/** Cuts from one place to another, more than so many springs. @param {Page} page @param {[number, number]} from @param {[number, number]} to */
+async function cut(page, from, to, severed = 10) {
   await page.press(...from);
   await sinks(page);
-  for (let k = 1; k <= 30; k++) {
-    const [x, y] = await page.at(from[0] + ((to[0] - from[0]) * k) / 30, from[1] + ((to[1] - from[1]) * k) / 30);
-    await page.page.mouse.move(x, y);
-    await new Promise((done) => setTimeout(done, 40));
-  }
+  await sweep(page, from, to, severed);
   await page.page.mouse.up();
 }
 
@@ -62,7 +58,7 @@ describe("a blade", () => {
     await page.page.click("#details");
     await page.until(({ drawing }) => drawing.hasTexture);
     const whole = await darkest(page, 0.5, 0.5);
-    await drag(page, [0.485, 0.3], [0.485, 0.75]);
+    await cut(page, [0.485, 0.3], [0.485, 0.75], 30);
     await page.until(({ wound }) => wound.severed > 30 && wound.waiting === 0 && wound.shown > 8);
     await page.says("figures", /cut\s*\d+ springs, by you/);
     // Both lips of each spring; a cut that ends in the sheet leaves one piece.
@@ -135,7 +131,7 @@ describe("a blade", () => {
 
   test("opens a solid, which is seen into", async () => {
     const page = await open(`${server.url}/?scene=liver-solid&tool=blade`);
-    await drag(page, [0.42, 0.5], [0.6, 0.5]);
+    await cut(page, [0.42, 0.5], [0.6, 0.5]);
     await page.until(({ wound }) => wound.severed > 10 && wound.cutFaces > 10 && wound.waiting === 0);
     const { cutFaces, severed } = await page.ask(({ wound }) => wound);
     assert.ok(cutFaces <= 2 * severed, `${cutFaces} faces of ${severed}`);
@@ -152,7 +148,7 @@ describe("a blade", () => {
 
   test("cuts the surface of an organ", async () => {
     const page = await open(`${server.url}/?scene=gallbladder&tool=blade`);
-    await drag(page, [0.42, 0.5], [0.6, 0.5]);
+    await cut(page, [0.42, 0.5], [0.6, 0.5]);
     await page.until(({ wound }) => wound.severed > 10 && wound.shown > 10 && wound.waiting === 0);
     await page.page.keyboard.press("Escape");
     await page.picture("wound-of-organ");
