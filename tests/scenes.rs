@@ -356,7 +356,7 @@ fn scenes_and_scripts_are_found_by_name() {
     refused(
         &palpate(&["run", "paper", "vertcal-60"]),
         &[
-            "there is no script `vertcal-60`; there are cut, cut-solid, grasp, lift, mine, oblique",
+            "there is no script `vertcal-60`; there are cut, cut-solid, dissect, grasp, lift, mine, oblique",
             "; did you mean `vertical-60`?",
         ],
     );

@@ -394,7 +394,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             depth_m: Some(0.02),
             foundation_n_per_m3: Some(4e5),
             damping_ratio: Some(0.7),
-            foundation_group: Some("bed".into()),
+            foundation_group: None,
         }),
         inclusions: vec![
             pb::Inclusion {
