@@ -255,8 +255,8 @@ describe("the page", () => {
     const groups = await page.page.locator("#scene optgroup:not([hidden])").evaluateAll((all) => all.map((group) => group.getAttribute("label")));
     assert.deepEqual(groups.slice(0, 3), ["Organs", "Slabs of tissue", "From the paper"]);
     const scenes = page.page.locator("#scene optgroup:is([label=Organs], [label^=Slabs], [label^=From]) option");
-    assert.equal(await scenes.count(), 11);
-    assert.equal(await scenes.locator("img").count(), 11);
+    assert.equal(await scenes.count(), 12);
+    assert.equal(await scenes.locator("img").count(), 12);
     assert.equal((await scenes.first().textContent())?.trim(), "Liver with two lumps");
     assert.deepEqual(await cut(page), []);
     const [panel, room] = await page.page.evaluate(
