@@ -84,7 +84,7 @@ impl Snapshot {
         let [rows, columns] = self.points;
         match &self.skin {
             None => &self.displacement_m,
-            Some(skin) if grid.points[0] > rows => self.with_cut_surface_m.get_or_init(|| {
+            Some(skin) if self.is_with_cut_surface(grid) => self.with_cut_surface_m.get_or_init(|| {
                 skin.displacement_with_cut_surface_m(&self.displacement_m, &self.cuts, grid.points[0] * columns)
             }),
             Some(skin) => {
@@ -96,8 +96,8 @@ impl Snapshot {
     /// Returns the bounding box of what frames of `grid` show. The thread that encodes computes it once for all encodings, not the stepping
     /// thread.
     pub(super) fn box_m(&self, grid: Refinement) -> &[[f32; 2]; 3] {
-        let with_cut_surface = usize::from(grid.points[0] > self.points[0]);
-        self.boxes_m[with_cut_surface].get_or_init(|| self.displacement_m(grid).each_ref().map(|values| range(values)))
+        self.boxes_m[usize::from(self.is_with_cut_surface(grid))]
+            .get_or_init(|| self.displacement_m(grid).each_ref().map(|values| range(values)))
     }
 
     /// Returns all points that frames of `grid` show.
@@ -108,11 +108,15 @@ impl Snapshot {
 
     /// Returns the number of rows of frames of `grid` that may differ from 0: rows for the surface within cuts have no vertices at first.
     pub(super) fn used_rows(&self, grid: Refinement) -> usize {
-        let [rows, _] = self.points;
         match &self.skin {
-            Some(skin) if grid.points[0] > rows => rows + skin.used_cut_rows(&self.cuts),
+            Some(skin) if self.is_with_cut_surface(grid) => self.points[0] + skin.used_cut_rows(&self.cuts),
             _ => grid.points[0],
         }
+    }
+
+    /// Returns whether frames of `grid` have rows for the surface within cuts.
+    fn is_with_cut_surface(&self, grid: Refinement) -> bool {
+        grid.points[0] > self.points[0]
     }
 }
 
