@@ -31,6 +31,9 @@ use tonic_types::StatusExt;
 /// Timeout of a test: long enough for any machine.
 pub const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// A configuration, from the folder of the repository, without the limit on a stepping thread's time.
+const BUSY_MACHINE: &str = "tests/common/busy_machine.toml";
+
 /// The folder of the repository, with the scenes and scripts.
 pub fn repository() -> &'static Path {
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -110,8 +113,11 @@ pub struct TestServer {
 }
 
 impl TestServer {
+    /// Starts a server that refuses no session for want of processor time, which a busy machine would decide.
+    /// A configuration among the arguments replaces this one.
     pub fn start(arguments: &[&str]) -> Self {
-        TestServer::start_at("127.0.0.1:0", arguments)
+        let own: &[&str] = if arguments.contains(&"--config") { &[] } else { &["--config", BUSY_MACHINE] };
+        TestServer::start_at("127.0.0.1:0", &[own, arguments].concat())
     }
 
     /// Starts a server that gives heavy work, such as the tissue of an exercise, all the time that it takes on a busy machine. `config` is

@@ -156,7 +156,7 @@ fn a_replay_is_exact_while_another_client_hammers_another_session() {
     server::client_program();
     let server = TestServer::start(&["--log", "error"]);
     let hammer = hammer(server.url.clone());
-    // Beside tips on a solid, a stepping thread has no share for another session.
+    // The solid's scripts take most of the time, and the test above plays them.
     for (scene, script) in shipped_scripts().into_iter().filter(|(scene, _)| scene != "liver-solid") {
         assert_same(&server, &scene, &script);
     }
