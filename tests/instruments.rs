@@ -253,6 +253,10 @@ fn instruments_that_nothing_can_be_are_refused_with_their_place() {
     for (text, expected) in [
         (of(pose), "instrument[0]: must have `tips`, a `shaft`, `jaws`, `scissors` or a `blade`"),
         (of(&format!("{tip}\nposes = []")), "instrument[0].poses: must have at least one pose"),
+        (
+            of(&format!("blade = {{ length_m = 0.5 }}\n{pose}")),
+            "instrument[0].blade.length_m: must be above 0 and at most",
+        ),
         (of(&format!("{tip}\n{pose}\nuntil_s = 0")), "instrument[0].until_s: must be later than the first pose"),
         (
             of(&format!("{tip}\nposes = [{{ at_s = 0, place_m = [0.03, 0.03, 0.05], jaw_rad = 0.1 }}]")),

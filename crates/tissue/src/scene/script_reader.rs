@@ -809,7 +809,12 @@ fn blade_of(item: &Item<'_>, shape: &dyn shape::RestShape) -> Result<Tip> {
         let length_m = positive(&fields.path("length_m"), fields.required_number("length_m")?)?;
         let radius_m = fields.number("radius_m")?.unwrap_or(BLADE_RADIUS_M);
         let tip = Tip { shape: TipShape::Blade, radius_m, edge_m: -length_m * DVec3::X, ..Tip::default() };
-        check_tip(fields.own_path(), shape, &tip).map(|()| tip)
+        // A script gives the length of the edge alone.
+        let as_given = |refusal: Refusal| {
+            let field = refusal.field.strip_suffix(".edge_m").map(|blade| format!("{blade}.length_m"));
+            Refusal { field: field.unwrap_or(refusal.field), ..refusal }
+        };
+        check_tip(fields.own_path(), shape, &tip).map_err(as_given).map(|()| tip)
     })
 }
 
