@@ -109,12 +109,13 @@ function toldText(told: Told, verb: string): string {
 }
 
 /** Describes what blades have cut, as far as it is known here; undefined if nothing is. */
-export function cutText({ session: { severed, pieces, cutsExhausted }, cutters, wound }: ShownSession): string | undefined {
+export function cutText({ session: { severed, severedAnchors, pieces, cutsExhausted }, cutters, wound }: ShownSession): string | undefined {
   if (severed === 0) return undefined;
+  const anchors = severedAnchors > 0 ? ` (${severedAnchors} anchors)` : "";
   const parts = pieces > 1 ? `, in ${pieces} pieces` : "";
   const by = cutters.size > 0 ? `, by ${[...cutters].join(", ")}` : "";
   const full = cutsExhausted ? "; no room for more" : "";
-  return `${severed} springs${parts}${by}${full}${wound.staysWhole ? "; drawn whole: it has other vertices than points" : ""}`;
+  return `${severed} springs${anchors}${parts}${by}${full}${wound.staysWhole ? "; drawn whole: it has other vertices than points" : ""}`;
 }
 
 /** Says why the last cut can't be undone; empty if it can. */
