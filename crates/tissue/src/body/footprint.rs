@@ -202,25 +202,42 @@ impl Footprint {
         leaps: bool,
         displacement_m: impl Fn([usize; 2]) -> DVec3,
     ) {
-        let of_point = |point| displacement_m(model.point_of(model.place_of(point)));
-        if leaps && self.disc.leap(place_m, &of_point) {
+        if leaps {
+            self.leap(model, place_m, &displacement_m);
+        }
+        if self.approach(model, place_m, &displacement_m) {
+            self.approach(model, place_m, &displacement_m);
+        }
+    }
+
+    /// Moves the disc to another part of a curved surface if that is nearer to `place_m`.
+    pub(crate) fn leap(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
+        if self.disc.leap(place_m, &|point| displacement_m(model.point_of(model.place_of(point)))) {
             self.lay(model);
         }
-        for _ in 0..2 {
-            let (surface_m, along) = self.surface(&displacement_m);
-            let mut beside_m = place_m - surface_m;
-            if !self.disc.is_flat() {
-                let outward = self.outward(&along);
-                let away_m = beside_m.dot(outward).abs();
-                beside_m -= beside_m.dot(outward) * outward;
-                // Far from a curved surface, a whole step would lead past the place.
-                beside_m *= self.radius_m / (self.radius_m + away_m + beside_m.length());
-                if beside_m.length() < BESIDE * self.radius_m {
-                    return;
-                }
+    }
+
+    /// Moves the disc towards the place of the displaced surface nearest to `place_m`, once. Returns whether it was not there yet.
+    pub(crate) fn approach(
+        &mut self,
+        model: &Model,
+        place_m: DVec3,
+        displacement_m: impl Fn([usize; 2]) -> DVec3,
+    ) -> bool {
+        let (surface_m, along) = self.surface(&displacement_m);
+        let mut beside_m = place_m - surface_m;
+        if !self.disc.is_flat() {
+            let outward = self.outward(&along);
+            let away_m = beside_m.dot(outward).abs();
+            beside_m -= beside_m.dot(outward) * outward;
+            // Far from a curved surface, a whole step would lead past the place.
+            beside_m *= self.radius_m / (self.radius_m + away_m + beside_m.length());
+            if beside_m.length() < BESIDE * self.radius_m {
+                return false;
             }
-            self.shift(model, beside_m, &along);
         }
+        self.shift(model, beside_m, &along);
+        true
     }
 
     /// Takes over the points that the disc covers.

@@ -1,10 +1,14 @@
 //! Where to look for springs that something crosses: the boxes around the tiles of a tissue.
+#![allow(unsafe_code)]
+
+use std::cell::RefCell;
 
 use glam::DVec3;
 
 use crate::body::model::Model;
+use crate::body::tables::SweepTables;
 use crate::kernel::field::{Layout, State};
-use crate::kernel::lanes::{self, SingleWork};
+use crate::kernel::lanes::{self, Run, Vector};
 use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, TILE, sides_of};
 
@@ -47,12 +51,17 @@ impl SpringSearch {
     pub(crate) fn near<T: Real>(
         &self,
         model: &Model,
-        layout: &Layout,
+        tables: &SweepTables<T>,
         state: &State<T>,
         moved: &Marks,
         within_m: [DVec3; 2],
     ) -> Vec<NearTile> {
-        lanes::single(&Near { search: self, unit_m: model.unit_m, layout, u: &state.u, moved, within_m })
+        let (layout, found) = (&tables.layout, RefCell::default());
+        assert!(state.u.len() >= 3 * layout.plane);
+        let near = Near { search: self, unit_m: model.unit_m, layout, u: &state.u, moved, within_m, found };
+        // SAFETY: the field has the layout's three planes, and the tiles are those of the layout.
+        unsafe { lanes::run(tables.width, &near) };
+        near.found.into_inner()
     }
 }
 
@@ -72,15 +81,14 @@ struct Near<'a, T> {
     u: &'a [T],
     moved: &'a Marks,
     within_m: [DVec3; 2],
+    found: RefCell<Vec<NearTile>>,
 }
 
-impl<T: Real> SingleWork for Near<'_, T> {
-    type Output = Vec<NearTile>;
-
+impl<T: Real> Run<T> for Near<'_, T> {
     #[inline(always)]
-    fn compute(&self) -> Vec<NearTile> {
-        let Near { search, unit_m, layout, u, moved, within_m: [least_m, most_m] } = self;
-        let mut near = Vec::new();
+    unsafe fn run<V: Vector<Real = T>>(&self) {
+        let Near { search, unit_m, layout, u, moved, within_m: [least_m, most_m], found } = self;
+        let mut near = found.borrow_mut();
         for (tile, [low_m, high_m]) in search.boxes.iter().enumerate() {
             let (below, above) = (high_m.cmplt(*least_m), low_m.cmpgt(*most_m));
             let mut displaced = [DVec3::ZERO; 2];
@@ -98,7 +106,8 @@ impl<T: Real> SingleWork for Near<'_, T> {
                         continue;
                     }
                     // No closure: it would not get the instructions of its caller.
-                    let [least, most] = range(layout, &u[c * layout.plane..], tile);
+                    // SAFETY: the caller's promise.
+                    let [least, most] = unsafe { range::<V>(layout, &u[c * layout.plane..], tile) };
                     (displaced[0][c], displaced[1][c]) = (least.wide(), most.wide());
                     touches = high_m[c] + unit_m * displaced[1][c] >= least_m[c]
                         && low_m[c] + unit_m * displaced[0][c] <= most_m[c];
@@ -108,30 +117,36 @@ impl<T: Real> SingleWork for Near<'_, T> {
                 near.push(NearTile { tile, displaced });
             }
         }
-        near
     }
 }
 
-/// Returns the least and the largest value in a tile of a plane, both with 0.
+/// Returns the least and the largest value in a tile of a plane, both with 0. Rows are padded to whole tiles: what is there may widen the
+/// range.
+///
+/// # Safety
+/// The processor has the instructions, and the tile is one of the layout, which the plane has.
 #[inline(always)]
-fn range<T: Real>(layout: &Layout, plane: &[T], tile: usize) -> [T; 2] {
-    let [rows, columns] = sides_of(layout, tile);
-    // A lane for each column: only then does the compiler compare a row at once.
-    let (mut least, mut most) = ([T::default(); TILE], [T::default(); TILE]);
-    for i in rows {
-        let row = &plane[i * layout.stride..][columns.start..columns.end];
-        let (least, most) = (&mut least[..row.len()], &mut most[..row.len()]);
-        // Not zipped: the compiler calls a function for each row then.
-        for lane in 0..row.len() {
-            let value = row[lane];
-            least[lane] = if value < least[lane] { value } else { least[lane] };
-            most[lane] = if value > most[lane] { value } else { most[lane] };
+unsafe fn range<V: Vector>(layout: &Layout, plane: &[V::Real], tile: usize) -> [V::Real; 2] {
+    let ([rows, columns], zero) = (sides_of(layout, tile), V::Real::default());
+    let mut ends = [[zero; TILE]; 2];
+    // SAFETY: the caller's promise; a row has the padding of a whole tile.
+    unsafe {
+        let (mut least, mut most) = (V::of(zero), V::of(zero));
+        for i in rows {
+            let row = plane.as_ptr().add(i * layout.stride + columns.start);
+            for part in 0..TILE / V::LANES {
+                let values = V::load(row.add(part * V::LANES));
+                least = values.smaller(least);
+                most = values.larger(most);
+            }
         }
+        least.store(ends[0].as_mut_ptr());
+        most.store(ends[1].as_mut_ptr());
     }
-    let (mut low, mut high) = (T::default(), T::default());
-    for lane in 0..TILE {
-        low = if least[lane] < low { least[lane] } else { low };
-        high = if most[lane] > high { most[lane] } else { high };
+    let (mut low, mut high) = (zero, zero);
+    for (least, most) in ends[0].into_iter().zip(ends[1]) {
+        low = if least < low { least } else { low };
+        high = if most > high { most } else { high };
     }
     [low, high]
 }

@@ -147,7 +147,7 @@ struct MeshTables<T> {
 /// The buffers and tables that a sweep needs besides the state. Each tissue has one.
 #[derive(Debug)]
 pub(crate) struct SweepTables<T> {
-    width: Width,
+    pub(crate) width: Width,
     pub(crate) layout: Layout,
     pub(crate) springs: Elastic<T>,
     /// `None` but for a mesh.

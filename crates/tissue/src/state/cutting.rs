@@ -189,7 +189,7 @@ impl<T: Real> TissueState<T> {
             (model.unit_m * vector(&state.u), ways * vector(&state.d))
         };
         for NearTile { tile, .. } in
-            search.near(model, layout, state, &tiles.moved, [least_m - reach_m, most_m + reach_m])
+            search.near(model, tables, state, &tiles.moved, [least_m - reach_m, most_m + reach_m])
         {
             let [rows, columns] = sides_of(layout, tile);
             // Plain loops: iterators over both are not inlined.

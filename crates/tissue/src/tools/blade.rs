@@ -32,7 +32,7 @@ impl Tool {
     }
 
     /// Determines the force of a blade on the tissue, N, at the end of a substep, which ends at `fraction` of the step. A blade that finds no
-    /// room to cut only pushes.
+    /// room to cut only pushes. Where a blade without a force pierces the surface is found once in a step.
     pub(crate) fn resist<T: Real>(
         &mut self,
         model: &Model,
@@ -44,13 +44,19 @@ impl Tool {
         let place_m = self.place_m(fraction);
         let edge_m = self.from_edge_m.lerp(self.tip.edge_m, fraction);
         let (edge, length_m) = (edge_m.normalize_or_zero(), edge_m.length());
+        let is_felt = model.scene.cutting.resistance_n(length_m) > 0.0;
+        if !is_felt && !plan.is_first(fraction) {
+            return ContactForce::default();
+        }
         if self.contact_state == ContactState::Free && plan.is_first(fraction) {
-            if model.scene.cutting.resistance_n(length_m) > 0.0 {
+            if is_felt {
                 self.seek_pierced(model, layout, state, [place_m, edge_m]);
             } else {
-                // Nothing is felt, so the place only follows the edge: once a step is enough.
+                // The place only follows the edge: a move in each step is enough.
+                let displacement_m = |point| displacement_m(model, layout, state, point);
                 let sought_m = place_m + self.pierced_m.clamp(0.0, length_m) * edge;
-                self.footprint.seek(model, sought_m, true, |point| displacement_m(model, layout, state, point));
+                self.footprint.leap(model, sought_m, displacement_m);
+                self.footprint.approach(model, sought_m, displacement_m);
             }
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));

@@ -29,7 +29,7 @@ impl<T: Real> TissueState<T> {
         let reach_m = DVec3::splat(depth_m);
         let around_m = [least_m - reach_m, most_m + reach_m];
         let mut found = Vec::new();
-        let near = search.near(model, layout, state, &tiles.moved, around_m);
+        let near = search.near(model, tables, state, &tiles.moved, around_m);
         let places = near.into_iter().flat_map(|NearTile { tile, .. }| {
             let [rows, columns] = sides_of(layout, tile);
             rows.flat_map(move |i| columns.clone().map(move |j| i * across + j))

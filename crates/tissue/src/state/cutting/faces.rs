@@ -94,7 +94,7 @@ impl<T: Real> TissueState<T> {
         // By the displacement of the least corner alone: a cube's middle follows.
         let reach_m = (REACH + SLACK) * model.unit_m;
         let [least_m, most_m] = within_m;
-        let near_tiles = search.near(model, layout, state, &tiles.moved, [least_m - reach_m, most_m + reach_m]);
+        let near_tiles = search.near(model, tables, state, &tiles.moved, [least_m - reach_m, most_m + reach_m]);
         for NearTile { tile, displaced } in near_tiles {
             let [rows, columns] = sides_of(layout, tile);
             // Where a cube's least corner is at rest if it is near, with room for rounding.
