@@ -166,7 +166,10 @@ fn a_score_has_what_the_tools_did_and_sessions_compare() {
     let disc_m2 = figure(&score, "covered_area_m2") / (std::f64::consts::PI * 2.5e-5);
     assert!((disc_m2 - 1.0).abs() < 0.1, "{disc_m2}");
     let crossing = &score["limit_crossings"][0];
-    assert!(score["limit_crossing_count"] == 1 && crossing["peak_n"] == peak_n, "{crossing}");
+    assert!(
+        score["limit_crossing_count"] == 1 && crossing["peak"] == peak_n && crossing["limit"] == "force_n",
+        "{crossing}"
+    );
     // The journal is simulated, and gives the same figures on paper and in the file.
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.5.mcap");
     let scored = |more: &[&str]| palpate(folder.path(), &[&["journal", "score", golden], more].concat());

@@ -244,6 +244,12 @@ pub struct Exercise {
     /// Whether a trainee is sent the result, with what was hidden.
     #[prost(bool, tag = "14")]
     pub tells_result: bool,
+    /// The mean pressure under a tip that none may exceed.
+    #[prost(double, optional, tag = "15")]
+    pub pressure_limit_pa: ::core::option::Option<f64>,
+    /// The strain of the tissue near a tool that none may exceed.
+    #[prost(double, optional, tag = "16")]
+    pub strain_limit: ::core::option::Option<f64>,
 }
 impl ::prost::Name for Exercise {
     const NAME: &'static str = "Exercise";

@@ -58,6 +58,8 @@ Field { number: 11, is_list: true, kind: FieldKind::Message(12) },
 Field { number: 12, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 13, is_list: true, kind: FieldKind::Text },
 Field { number: 14, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 15, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 16, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.ExerciseLine", bytes: size_of::<crate::pb::ExerciseLine>(), decode: |bytes| <crate::pb::ExerciseLine as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: true, kind: FieldKind::Message(0) },

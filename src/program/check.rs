@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use palpate_refusal::printable::printable_lines;
 use palpate_session::check;
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::exercise_judge::ExerciseJudge;
+use palpate_session::exercise_judge::{ExerciseJudge, thresholds};
 use palpate_tissue::Model;
 use palpate_tissue::scene::collection::find_script;
 
@@ -64,7 +64,11 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
     let of = |count: usize, one: &str| format!("{count} {one}{}", if count == 1 { "" } else { "s" });
     let mut parts = vec![format!("{} with seed {seed}", of(lumps.len(), "lump"))];
     parts.extend(exercise.time_limit_s.map(|limit_s| format!("{limit_s} s")));
-    parts.extend(exercise.limits.force_n.map(|limit_n| format!("{limit_n} N")));
+    let limits = thresholds(exercise).limits;
+    parts.extend(limits.given().map(|(kind, limit)| {
+        let (name, unit) = kind.name_and_unit();
+        format!("{name} at most {limit}{unit}")
+    }));
     let weight: f64 = exercise.criteria.iter().map(|criterion| criterion.weight).sum();
     parts.push(format!(
         "{} of weight {weight} in all",

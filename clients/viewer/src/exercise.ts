@@ -135,6 +135,8 @@ export class ExercisePanel {
     const rows: [string, string][] = [];
     if (exercise?.timeLimitS !== undefined) rows.push(["Time", timeText(exercise.timeLimitS)]);
     if (exercise?.forceLimitN !== undefined) rows.push(["Force", `at most ${quantity(exercise.forceLimitN, "N")}`]);
+    if (exercise?.pressureLimitPa !== undefined) rows.push(["Pressure", `at most ${quantity(exercise.pressureLimitPa, "Pa")}`]);
+    if (exercise?.strainLimit !== undefined) rows.push(["Strain", `at most ${Number((100 * exercise.strainLimit).toPrecision(3))} %`]);
     return listed(rows);
   }
 

@@ -1,4 +1,4 @@
-//! The force of a tool: peak, mean, integral, derivative, share above a limit, pressure, indentation, work.
+//! The force of a tool: peak, mean, integral, derivative, pressure, indentation, strain, work, and the shares above limits.
 //!
 //! A row holds for the step that it ends, so that a force that is constant over each step has an exact integral. Work
 //! uses the mean of the forces at both ends of a step.
@@ -7,6 +7,7 @@ use glam::DVec3;
 
 use crate::definition::{Figures, MeasureDefinition, Scope};
 use crate::input::ToolRow;
+use crate::limit::{LimitKind, ToolLimits};
 use crate::window::MotionWindow;
 
 const TREJOS: &str = "Trejos et al. 2014, doi:10.1007/s00464-014-3442-9";
@@ -51,17 +52,6 @@ pub(crate) const FORCE_DERIVATIVE: MeasureDefinition = MeasureDefinition {
     )
 };
 
-pub(crate) const ABOVE_LIMIT: MeasureDefinition = MeasureDefinition {
-    range: [0.0, 1.0],
-    ..of_force(
-        "force_above_limit_share",
-        "1",
-        "time with |F| above the chosen limit over the contact time",
-        "Palpate",
-        "Which part of the contact was too strong.",
-    )
-};
-
 pub(crate) const PEAK_PRESSURE: MeasureDefinition = of_force(
     "peak_pressure_pa",
     "Pa",
@@ -76,6 +66,14 @@ pub(crate) const PEAK_INDENTATION: MeasureDefinition = of_force(
     "max over the steps in contact of how far the tissue under the tool is in from rest",
     "Palpate",
     "How deep the tissue was pressed at most.",
+);
+
+pub(crate) const PEAK_STRAIN: MeasureDefinition = of_force(
+    "peak_strain",
+    "1",
+    "max of (L − L₀)/L₀ over the steps in contact, of what joins neighbours of the tissue within two radii of the tip",
+    "Palpate",
+    "How far the tissue near a tool was stretched at most.",
 );
 
 pub(crate) const WORK: MeasureDefinition = MeasureDefinition {
@@ -95,7 +93,9 @@ pub(crate) struct ForceMeasures {
     peak_n: f64,
     /// Σ |F| over the steps in contact, N.
     sum_n: f64,
-    steps_above: u64,
+    /// Number of steps above each limit, in the order of [`LimitKind::ALL`].
+    steps_above: [u64; 3],
+    peak_strain: Option<f64>,
     peak_pa: Option<f64>,
     peak_indentation_m: Option<f64>,
     work_j: f64,
@@ -118,7 +118,7 @@ impl ForceMeasures {
         self.before = Some((row.place_m, row.force_n));
     }
 
-    pub(crate) fn step(&mut self, row: &ToolRow, limit_n: Option<f64>) {
+    pub(crate) fn step(&mut self, row: &ToolRow, limits: ToolLimits) {
         if let Some((place_m, force_n)) = self.before {
             self.work_j -= (0.5 * (force_n + row.force_n)).dot(row.place_m - place_m);
         }
@@ -129,7 +129,10 @@ impl ForceMeasures {
         let force_n = row.force_n.length();
         self.peak_n = self.peak_n.max(force_n);
         self.sum_n += force_n;
-        self.steps_above += u64::from(limit_n.is_some_and(|limit_n| force_n > limit_n));
+        for (kind, limit) in limits.given() {
+            self.steps_above[kind as usize] += u64::from(row.limited(kind) > limit);
+        }
+        self.peak_strain = larger(self.peak_strain, row.strain);
         self.peak_indentation_m = larger(self.peak_indentation_m, Some(row.indentation_m.max(0.0)));
         self.peak_pa = larger(self.peak_pa, row.disc.map(|disc| disc.pressure_pa));
     }
@@ -150,16 +153,19 @@ impl ForceMeasures {
     }
 
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn figures(&self, contact_steps: u64, rate_hz: f64, has_limit: bool, figures: &mut Figures) {
+    pub(crate) fn figures(&self, contact_steps: u64, rate_hz: f64, limits: ToolLimits, figures: &mut Figures) {
         let of_contact = |sum: f64| (contact_steps > 0).then(|| sum / contact_steps as f64);
         figures.add(&PEAK_FORCE, self.peak_n);
         figures.add(&MEAN_FORCE, of_contact(self.sum_n));
         figures.add(&FORCE_INTEGRAL, self.sum_n / rate_hz);
         let (squared, count) = self.derivative;
         figures.add(&FORCE_DERIVATIVE, (count > 0).then(|| (squared / count as f64).sqrt() / self.window_s));
-        figures.add(&ABOVE_LIMIT, of_contact(self.steps_above as f64).filter(|_| has_limit));
+        for (kind, _) in limits.given() {
+            figures.add(kind.share(), of_contact(self.steps_above[kind as usize] as f64));
+        }
         figures.add(&PEAK_PRESSURE, self.peak_pa);
         figures.add(&PEAK_INDENTATION, self.peak_indentation_m);
+        figures.add(&PEAK_STRAIN, self.peak_strain);
         figures.add(&WORK, self.work_j);
     }
 
@@ -167,7 +173,9 @@ impl ForceMeasures {
     pub(crate) fn join(&mut self, other: &ForceMeasures) {
         self.peak_n = self.peak_n.max(other.peak_n);
         self.sum_n += other.sum_n;
-        self.steps_above += other.steps_above;
+        self.steps_above =
+            LimitKind::ALL.map(|kind| self.steps_above[kind as usize] + other.steps_above[kind as usize]);
+        self.peak_strain = larger(self.peak_strain, other.peak_strain);
         self.peak_pa = larger(self.peak_pa, other.peak_pa);
         self.peak_indentation_m = larger(self.peak_indentation_m, other.peak_indentation_m);
         self.work_j += other.work_j;
@@ -188,7 +196,8 @@ mod tests {
 
     #[test]
     fn a_step_of_force_has_its_integral_mean_and_share_above_the_limit() {
-        let options = MeasureOptions { force_limit_n: Some(1.5), ..MeasureOptions::default() };
+        let limits = ToolLimits { force_n: Some(1.5), ..ToolLimits::default() };
+        let options = MeasureOptions { limits, ..MeasureOptions::default() };
         // 0.5 s of nothing, 1 s of 1 N, 0.5 s of 2 N.
         let tool = pressed(&options, 2000, |step| {
             let force_n = if step <= 500 {
@@ -235,6 +244,38 @@ mod tests {
         near("work_j", 0.5 * stiffness_n_per_m * 0.004 * 0.004);
         near("peak_pressure_pa", 0.8 / (std::f64::consts::PI * 2.5e-5));
         near("peak_indentation_m", 0.004);
+    }
+
+    #[test]
+    fn pressure_and_strain_have_their_peaks_and_their_shares_above_the_limits() {
+        let limits = ToolLimits { force_n: None, pressure_pa: Some(3000.0), strain: Some(0.2) };
+        let options = MeasureOptions { limits, ..MeasureOptions::default() };
+        // Half a wave of 4 s, the same in pressure and strain, with contact in its second half.
+        let part = |step: u32| libm::sin(std::f64::consts::PI * f64::from(step) / 4000.0);
+        let tool = pressed(&options, 4000, |step| {
+            let pressure_pa = 6000.0 * part(step);
+            let disc = Some(PressedDisc { rest_m: DVec3::ZERO, normal: DVec3::Z, radius_m: 0.005, pressure_pa });
+            ToolRow { is_in_contact: step > 2000, disc, strain: Some(0.22 * part(step)), ..row(DVec3::ZERO) }
+        });
+        // The wave falls below 3000/6000 at 5/6 of its time, and below 0.2/0.22 at 1 − asin(0.2/0.22)/π of it.
+        let strained = 0.5 - libm::asin(0.2 / 0.22) / std::f64::consts::PI;
+        for (name, expected) in [
+            ("peak_pressure_pa", 6000.0),
+            ("peak_strain", 0.22),
+            ("pressure_above_limit_share", (5.0 / 6.0 - 0.5) / 0.5),
+            ("strain_above_limit_share", strained / 0.5),
+        ] {
+            let value = figure(&tool, name).unwrap();
+            assert!((value - expected).abs() < 1e-3 * expected.max(1.0), "{name}: {value} instead of {expected}");
+        }
+        assert_eq!(figure(&tool, "force_above_limit_share"), None);
+        let told: Vec<_> =
+            tool.timeline().crossings().iter().map(|crossing| (crossing.limit, crossing.steps)).collect();
+        // The contact begins above both limits.
+        assert!(
+            matches!(told[..], [(LimitKind::Pressure, [2001, 3333]), (LimitKind::Strain, [2001, 2547])]),
+            "{told:?}"
+        );
     }
 
     #[test]

@@ -3,6 +3,8 @@
 use glam::DVec3;
 use palpate_refusal::{Reason, Refusal, Result, positive};
 
+use crate::limit::{LimitKind, ToolLimits};
+
 /// The part of the surface that a tool presses with an area, at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PressedDisc {
@@ -31,13 +33,27 @@ pub struct ToolRow {
     pub indentation_m: f64,
     /// The disc that it presses; `None` for a tool without an area, and without contact.
     pub disc: Option<PressedDisc>,
+    /// The largest strain of the tissue near the tool, (L − L₀)/L₀ of what joins neighbours; `None` if it is not measured.
+    pub strain: Option<f64>,
+}
+
+impl ToolRow {
+    /// Returns the value that a limit is compared with: 0 without contact, and where the tool has none.
+    pub(crate) fn limited(&self, kind: LimitKind) -> f64 {
+        let value = match kind {
+            LimitKind::Force => Some(self.force_n.length()),
+            LimitKind::Pressure => self.disc.map(|disc| disc.pressure_pa),
+            LimitKind::Strain => self.strain,
+        };
+        value.filter(|_| self.is_in_contact).unwrap_or(0.0)
+    }
 }
 
 /// The thresholds of measures, and which tools belong to one hand.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeasureOptions {
-    /// The force, N, above which a tool is too strong. Without it there is no `force_above_limit_share`.
-    pub force_limit_n: Option<f64>,
+    /// The limits of a tool. Without one there is no share above it, such as `force_above_limit_share`.
+    pub limits: ToolLimits,
     /// The pressure, Pa, from which a place counts as pressed ([`DEFAULT_COVERAGE_PA`](Self::DEFAULT_COVERAGE_PA)).
     pub coverage_pa: f64,
     /// The force, N, from which a contact counts as a press ([`DEFAULT_PRESS_N`](Self::DEFAULT_PRESS_N)).
@@ -61,9 +77,9 @@ impl MeasureOptions {
     ///
     /// # Errors
     /// Refuses a threshold that is not above 0 or not finite, a hand without a tool, a tool in two hands, and one hand
-    /// or more than two. `field` is the name of the option.
+    /// or more than two. `field` is the name of the option; of a limit, that of [`ToolLimits::check`].
     pub fn check(&self) -> Result<()> {
-        self.force_limit_n.map_or(Ok(0.0), |limit_n| positive("force_limit_n", limit_n))?;
+        self.limits.check()?;
         positive("coverage_pa", self.coverage_pa)?;
         positive("press_n", self.press_n)?;
         let refuse = |message: &str| Err(Refusal::new(Reason::OutOfRange, "hands", message));
@@ -85,7 +101,7 @@ impl MeasureOptions {
 impl Default for MeasureOptions {
     fn default() -> Self {
         MeasureOptions {
-            force_limit_n: None,
+            limits: ToolLimits::default(),
             coverage_pa: Self::DEFAULT_COVERAGE_PA,
             press_n: Self::DEFAULT_PRESS_N,
             seen_along: None,

@@ -22,6 +22,7 @@ mod hands;
 pub mod incision;
 mod input;
 mod jerk;
+pub mod limit;
 mod measures;
 mod path;
 mod press;
@@ -36,5 +37,6 @@ mod window;
 
 pub use definition::{Figure, MeasureDefinition, Scope};
 pub use input::{MeasureOptions, PressedDisc, ToolRow};
+pub use limit::{LimitKind, ToolLimits};
 pub use measures::Measures;
 pub use truth::ExerciseTruth;

@@ -33,6 +33,7 @@ use crate::window::window_steps;
 ///     is_in_contact: true,
 ///     indentation_m: 0.002,
 ///     disc: None,
+///     strain: None,
 /// };
 /// measures.begin(&[row]);
 /// (0..1000).for_each(|_| measures.step(&[row]));
@@ -111,7 +112,7 @@ impl Measures {
             let tool = self.tools.entry(row.tool).or_insert_with(|| ToolMeasures::new(self.rate_hz));
             tool.step(row, &self.options);
         }
-        self.timeline.step(rows, self.options.force_limit_n);
+        self.timeline.step(rows, self.options.limits);
         if self.steps.is_multiple_of(window_steps(self.rate_hz)) {
             let hands = &self.options.hands;
             let is_of_hand = |number: &u32| hands.is_empty() || hands.iter().any(|hand| hand.contains(number));
@@ -150,7 +151,7 @@ impl Measures {
         &self.surface
     }
 
-    /// Returns the force over time, and when it was above the limit.
+    /// Returns the force over time, and when a limit was exceeded.
     pub fn timeline(&self) -> &Timeline {
         &self.timeline
     }
@@ -175,7 +176,7 @@ impl Measures {
         let mut forces = ForceMeasures::default();
         self.tools.values().for_each(|tool| forces.join(&tool.forces));
         let contact_steps = self.tools.values().map(|tool| tool.times.contact_steps).sum();
-        forces.figures(contact_steps, self.rate_hz, self.options.force_limit_n.is_some(), &mut figures);
+        forces.figures(contact_steps, self.rate_hz, self.options.limits, &mut figures);
         figures.add(&PRESS_COUNT, self.tools.values().map(|tool| tool.presses.count).sum::<u64>() as f64);
         if let Some(paths_m) = self.paths_of_hands_m() {
             figures.add(&HAND_BALANCE, balance(paths_m));

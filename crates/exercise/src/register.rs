@@ -1,9 +1,9 @@
 //! The register: all measures, in the order in which they are told.
 
 use crate::definition::MeasureDefinition;
-use crate::{answers, coverage, detection, force, hands, incision, jerk, path, press, sparc, tasks, time};
+use crate::{answers, coverage, detection, force, hands, incision, jerk, limit, path, press, sparc, tasks, time};
 
-const DEFINITIONS: [&MeasureDefinition; 40] = [
+const DEFINITIONS: [&MeasureDefinition; 43] = [
     &time::TIME,
     &time::CONTACT_TIME,
     &time::IDLE_TIME,
@@ -17,9 +17,12 @@ const DEFINITIONS: [&MeasureDefinition; 40] = [
     &force::MEAN_FORCE,
     &force::FORCE_INTEGRAL,
     &force::FORCE_DERIVATIVE,
-    &force::ABOVE_LIMIT,
+    &limit::FORCE_ABOVE_LIMIT,
+    &limit::PRESSURE_ABOVE_LIMIT,
+    &limit::STRAIN_ABOVE_LIMIT,
     &force::PEAK_PRESSURE,
     &force::PEAK_INDENTATION,
+    &force::PEAK_STRAIN,
     &force::WORK,
     &press::PRESS_COUNT,
     &press::MEAN_PRESS_TIME,
@@ -47,7 +50,7 @@ const DEFINITIONS: [&MeasureDefinition; 40] = [
 ];
 
 /// The first of the measures that need the truth of an exercise: they follow those that need none.
-const FIRST_OF_TRUTH: usize = 24;
+const FIRST_OF_TRUTH: usize = 27;
 
 /// Returns the definitions of all measures. [`Measures`](crate::Measures) gives the first of them, and
 /// [`ExerciseTruth`](crate::ExerciseTruth) those that need the truth of an exercise ([`needs_truth`]).
@@ -73,6 +76,7 @@ mod tests {
 
     use super::*;
     use crate::input::{MeasureOptions, PressedDisc, ToolRow};
+    use crate::limit::ToolLimits;
     use crate::measures::Measures;
 
     /// The row of a measure in the guide.
@@ -103,7 +107,8 @@ mod tests {
     fn every_measure_has_a_figure_within_its_range_and_no_name_comes_twice() {
         let corner = |x: f64, y: f64| DVec3::new(x, y, 0.0);
         let surface = [[corner(0.0, 0.0), corner(0.1, 0.0), corner(0.0, 0.1)]];
-        let options = MeasureOptions { force_limit_n: Some(1.0), ..MeasureOptions::default() };
+        let limits = ToolLimits { force_n: Some(1.0), pressure_pa: Some(1e3), strain: Some(0.1) };
+        let options = MeasureOptions { limits, ..MeasureOptions::default() };
         let mut measures = Measures::new(500.0, 0, options, surface.into_iter());
         let mut random = fastrand::Rng::with_seed(5);
         for _ in 0..3000 {
@@ -115,7 +120,8 @@ mod tests {
                 let is_in_contact = number() > 0.0;
                 let disc =
                     PressedDisc { rest_m: place_m, normal: DVec3::Z, radius_m: 0.05, pressure_pa: 4e3 * number() };
-                let row = ToolRow { tool, place_m, force_n, is_in_contact, indentation_m: number(), disc: Some(disc) };
+                let (indentation_m, disc, strain) = (number(), Some(disc), Some(number().max(0.0)));
+                let row = ToolRow { tool, place_m, force_n, is_in_contact, indentation_m, disc, strain };
                 rows.extend((number() > -0.9).then_some(row));
             }
             measures.step(&rows);

@@ -130,6 +130,7 @@ mod tests {
             is_in_contact,
             indentation_m: 0.0,
             disc: None,
+            strain: None,
         };
         for (x_m, is_in_contact, steps) in [(0.03, true, 7), (0.045, true, 20), (0.05, true, 30), (0.05, false, 100)] {
             tasks.step(&[at(0.0, true), at(x_m, is_in_contact)], 0.0, steps);

@@ -1,8 +1,9 @@
-//! The force over time, for a curve, and the times at which it was above the limit: in bounded memory.
+//! The force over time, for a curve, and the times at which a tool was above a limit: in bounded memory.
 
 use std::collections::BTreeMap;
 
 use crate::input::ToolRow;
+use crate::limit::{LimitKind, ToolLimits};
 
 /// The largest number of values of a curve. One that is longer is coarsened by pairs.
 pub const MAX_CURVE_VALUES: usize = 4096;
@@ -10,18 +11,20 @@ pub const MAX_CURVE_VALUES: usize = 4096;
 /// The largest number of crossings that are kept.
 pub const MAX_CROSSINGS: usize = 1000;
 
-/// A time in which the force of a tool was above the limit.
+/// A time in which a tool was above a limit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LimitCrossing {
     /// The tool.
     pub tool: u32,
+    /// The limit.
+    pub limit: LimitKind,
     /// The first and the last step at whose end it was.
     pub steps: [u64; 2],
-    /// The largest force in it, N.
-    pub peak_n: f64,
+    /// The largest value in it: N, Pa, or a strain.
+    pub peak: f64,
 }
 
-/// The force of each tool over time, and when it was above the limit.
+/// The force of each tool over time, and when it was above a limit.
 #[derive(Debug, Clone)]
 pub struct Timeline {
     rate_hz: f64,
@@ -32,8 +35,8 @@ pub struct Timeline {
     curves: BTreeMap<u32, Vec<f64>>,
     crossings: Vec<LimitCrossing>,
     count: u64,
-    /// By tool: its crossing that goes on, as an index if it is kept.
-    open: BTreeMap<u32, Option<usize>>,
+    /// By tool and limit: its crossing that goes on, as an index if it is kept.
+    open: BTreeMap<(u32, usize), Option<usize>>,
 }
 
 impl Timeline {
@@ -51,7 +54,7 @@ impl Timeline {
     }
 
     #[allow(clippy::cast_possible_truncation)]
-    pub(crate) fn step(&mut self, rows: &[ToolRow], limit_n: Option<f64>) {
+    pub(crate) fn step(&mut self, rows: &[ToolRow], limits: ToolLimits) {
         if (self.steps / self.steps_each) as usize == MAX_CURVE_VALUES {
             for curve in self.curves.values_mut() {
                 *curve = curve.chunks(2).map(|pair| pair.iter().copied().fold(0.0, f64::max)).collect();
@@ -61,30 +64,33 @@ impl Timeline {
         let index = (self.steps / self.steps_each) as usize;
         self.steps += 1;
         for row in rows {
-            let force_n = if row.is_in_contact { row.force_n.length() } else { 0.0 };
+            let force_n = row.limited(LimitKind::Force);
             let curve = self.curves.entry(row.tool).or_default();
             curve.resize(index + 1, 0.0);
             curve[index] = curve[index].max(force_n);
-            if limit_n.is_some_and(|limit_n| force_n > limit_n) {
-                self.cross(row.tool, force_n);
-            } else {
-                self.open.remove(&row.tool);
+            for (kind, limit) in limits.given() {
+                let value = row.limited(kind);
+                if value > limit {
+                    self.cross(row.tool, kind, value);
+                } else {
+                    self.open.remove(&(row.tool, kind as usize));
+                }
             }
         }
-        self.open.retain(|tool, _| rows.iter().any(|row| row.tool == *tool));
+        self.open.retain(|(tool, _), _| rows.iter().any(|row| row.tool == *tool));
     }
 
-    fn cross(&mut self, tool: u32, force_n: f64) {
+    fn cross(&mut self, tool: u32, limit: LimitKind, value: f64) {
         let step = self.begin_step + self.steps;
-        let index = *self.open.entry(tool).or_insert_with(|| {
+        let index = *self.open.entry((tool, limit as usize)).or_insert_with(|| {
             self.count += 1;
             (self.crossings.len() < MAX_CROSSINGS).then(|| {
-                self.crossings.push(LimitCrossing { tool, steps: [step, step], peak_n: 0.0 });
+                self.crossings.push(LimitCrossing { tool, limit, steps: [step, step], peak: 0.0 });
                 self.crossings.len() - 1
             })
         });
         if let Some(crossing) = index.map(|index| &mut self.crossings[index]) {
-            (crossing.steps[1], crossing.peak_n) = (step, crossing.peak_n.max(force_n));
+            (crossing.steps[1], crossing.peak) = (step, crossing.peak.max(value));
         }
     }
 
@@ -100,12 +106,12 @@ impl Timeline {
         self.curves.iter().map(|(tool, curve)| (*tool, curve.as_slice()))
     }
 
-    /// Returns the times above the limit, by ascending first step: the first [`MAX_CROSSINGS`] of them.
+    /// Returns the times above a limit, by ascending first step: the first [`MAX_CROSSINGS`] of them.
     pub fn crossings(&self) -> &[LimitCrossing] {
         &self.crossings
     }
 
-    /// Returns how often the limit was crossed.
+    /// Returns how often a limit was crossed.
     pub fn crossing_count(&self) -> u64 {
         self.count
     }
@@ -121,7 +127,8 @@ mod tests {
 
     #[test]
     fn a_curve_keeps_each_peak_and_a_limit_each_crossing() {
-        let options = MeasureOptions { force_limit_n: Some(1.0), ..MeasureOptions::default() };
+        let limits = ToolLimits { force_n: Some(1.0), ..ToolLimits::default() };
+        let options = MeasureOptions { limits, ..MeasureOptions::default() };
         let strong = [100, 9000, 9001, 19_990];
         let measures = pressed(&options, 20_000, |step| {
             let force_n = if strong.contains(&step) { 2.0 } else { 0.5 };

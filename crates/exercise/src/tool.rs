@@ -69,7 +69,7 @@ impl ToolMeasures {
         }
         self.sampler.add(row);
         self.times.step(row);
-        self.forces.step(row, options.force_limit_n);
+        self.forces.step(row, options.limits);
         self.presses.step(row, options.press_n);
     }
 
@@ -108,7 +108,7 @@ impl ToolMeasures {
         self.path.figures(&self.sampler, self.times.steps as f64 / self.rate_hz, figures);
         self.jerk.figures(figures);
         self.speeds.figures(figures);
-        self.forces.figures(self.times.contact_steps, self.rate_hz, options.force_limit_n.is_some(), figures);
+        self.forces.figures(self.times.contact_steps, self.rate_hz, options.limits, figures);
         self.presses.figures(self.times.contact_steps, self.rate_hz, figures);
     }
 }
@@ -125,8 +125,8 @@ pub(crate) mod tests {
     const RATE_HZ: f64 = 1000.0;
 
     pub(crate) fn row(place_m: DVec3) -> ToolRow {
-        let (force_n, is_in_contact, indentation_m, disc) = (DVec3::ZERO, false, 0.0, None);
-        ToolRow { tool: 0, place_m, force_n, is_in_contact, indentation_m, disc }
+        let (force_n, is_in_contact, indentation_m) = (DVec3::ZERO, false, 0.0);
+        ToolRow { tool: 0, place_m, force_n, is_in_contact, indentation_m, disc: None, strain: None }
     }
 
     /// Measures a tool without contact over some steps, by its place over time, s.

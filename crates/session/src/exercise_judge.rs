@@ -8,10 +8,10 @@ use crate::{RecordedMark, Session};
 use palpate_exercise::answers::{AnswerRules, HiddenTarget, MarkedPlace, place_count};
 use palpate_exercise::incision::{SeveredPlace, TargetLine};
 use palpate_exercise::tasks::{AvoidedBall, LiftTarget, TaskMeasures};
-use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, ToolRow, register};
+use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, ToolLimits, ToolRow, register};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean};
 use palpate_tissue::scene::action_check::check_free;
-use palpate_tissue::scene::exercise::{Criterion, Exercise, Lump};
+use palpate_tissue::scene::exercise::{Criterion, Exercise, ExerciseLimits, Lump};
 use palpate_tissue::shape::{PointId, RestShape};
 use palpate_tissue::{Model, TieState};
 
@@ -232,6 +232,8 @@ fn criteria(exercise: &Exercise) -> Result<()> {
             "avoided_contact_s" | "avoided_peak_force_n" => (!exercise.avoid.is_empty(), "an [[avoid]]"),
             "lift_height_m" | "held_share" => (exercise.lift.is_some(), "[lift]"),
             "force_above_limit_share" => (exercise.limits.force_n.is_some(), "[limits] with force_n"),
+            "pressure_above_limit_share" => (exercise.limits.pressure_pa.is_some(), "[limits] with pressure_pa"),
+            "peak_strain" | "strain_above_limit_share" => (exercise.limits.strain.is_some(), "[limits] with strain"),
             _ => (true, ""),
         };
         if !is_there {
@@ -269,11 +271,17 @@ fn check_places(exercise: &Exercise, shape: &dyn RestShape) -> Result<()> {
     check_free("lift.place_m", shape, shape.nearest(lift.place_m))
 }
 
+/// Returns the limits of an exercise.
+fn limits(exercise: &Exercise) -> ToolLimits {
+    let ExerciseLimits { force_n, pressure_pa, strain } = exercise.limits;
+    ToolLimits { force_n, pressure_pa, strain }
+}
+
 /// Returns the thresholds of an exercise, where it gives any.
 pub fn thresholds(exercise: &Exercise) -> MeasureOptions {
     let usual = MeasureOptions::default();
     MeasureOptions {
-        force_limit_n: exercise.limits.force_n,
+        limits: limits(exercise),
         coverage_pa: exercise.coverage.map_or(usual.coverage_pa, |coverage| coverage.pressure_pa),
         seen_along: Some(exercise.seen_along),
         ..usual

@@ -71,28 +71,35 @@ impl MeasureRecorder {
 
     fn collect(&mut self, session: &Session) {
         self.rows.clear();
+        // It reads the springs near a tool: only for who asks for it.
+        let is_measured = self.measures.options().limits.strain.is_some();
+        let edge_m = session.model().shape().edge_m();
+        let near = |rest_m: DVec3, radius_m: f64| {
+            let reach_m = STRAIN_REACH * radius_m.max(edge_m);
+            is_measured.then(|| session.tissue().strain_around(rest_m, reach_m))
+        };
         if let Some(script) = &self.continuous {
             let step = session.step_count();
             let now = step.checked_sub(1).map_or(Moment::start_of(0), |step| Moment { step, fraction: 1.0 });
             for (tool, profile) in script.forces.iter().enumerate() {
                 let poke = profile.at(now, script.rate_hz);
                 if poke.force_n != DVec3::ZERO {
-                    self.rows.push(row_of_push(session, tool, &poke));
+                    self.rows.push(row_of_push(session, tool, &poke, &near));
                 }
             }
             for (index, profile) in script.moves.iter().enumerate() {
-                self.rows.push(row_of_point(session, script.forces.len() + index, profile.point));
+                self.rows.push(row_of_point(session, script.forces.len() + index, profile.point, &near));
             }
         }
         let of = |(number, tool): (usize, &Tool)| match session.tissue().tool_contact(number) {
-            Some(contact) => Some(row_of_tip(number, &contact, tool.posed.as_ref().map(|posed| posed.tip))),
+            Some(contact) => Some(row_of_tip(number, &contact, tool.posed.as_ref().map(|posed| posed.tip), &near)),
             None => {
                 let point = tool.control_point.filter(|_| tool.posed.is_none())?;
                 let state = session.tissue().point(point);
                 let acts = state.constraint_n.is_some() || state.applied_n != DVec3::ZERO;
                 acts.then(|| match &tool.around {
-                    Some(poke) => row_of_push(session, number, poke),
-                    None => row_of_point(session, number, point),
+                    Some(poke) => row_of_push(session, number, poke, &near),
+                    None => row_of_point(session, number, point, &near),
                 })
             }
         };
@@ -102,6 +109,12 @@ impl MeasureRecorder {
         self.rows.dedup_by_key(|row| row.tool);
     }
 }
+
+/// How far around a tool the strain of the tissue is measured: radii of its tip, and at least edges of the tissue.
+const STRAIN_REACH: f64 = 2.0;
+
+/// The largest strain of the tissue near a place at rest, m, that a tool of some radius, m, touches; `None` if it is not measured.
+type StrainNear<'f> = &'f dyn Fn(DVec3, f64) -> Option<f64>;
 
 /// The cosine of the angle up to which a triangle faces who looks at it: 60°.
 const FACES: f64 = 0.5;
@@ -132,7 +145,7 @@ fn all_triangles_m(shape: &dyn RestShape) -> Vec<[DVec3; 3]> {
 }
 
 #[allow(clippy::cast_possible_truncation)]
-fn row_of_tip(tool: usize, contact: &ToolContact, tip: Option<Tip>) -> ToolRow {
+fn row_of_tip(tool: usize, contact: &ToolContact, tip: Option<Tip>, near: StrainNear<'_>) -> ToolRow {
     let (rest_m, normal) = match contact.rest {
         Some(rest) => (rest.place_m, rest.normal),
         None => (contact.anchor_m, DVec3::new(0.0, 0.0, 1.0_f64.copysign(contact.normal.z))),
@@ -147,14 +160,16 @@ fn row_of_tip(tool: usize, contact: &ToolContact, tip: Option<Tip>) -> ToolRow {
         PressedDisc { rest_m, normal, radius_m, pressure_pa }
     });
     let (place_m, force_n) = (contact.place_m, contact.force_on_tool_n);
-    ToolRow { tool: tool as u32, place_m, force_n, is_in_contact, indentation_m, disc }
+    let radius_m = tip.filter(|tip| tip.shape != TipShape::Blade).map_or(0.0, |tip| tip.radius_m);
+    let strain = if is_in_contact { near(rest_m, radius_m) } else { None };
+    ToolRow { tool: tool as u32, place_m, force_n, is_in_contact, indentation_m, disc, strain }
 }
 
 /// Returns the row of a force around a place.
 #[allow(clippy::cast_possible_truncation)]
-fn row_of_push(session: &Session, tool: usize, poke: &Poke) -> ToolRow {
+fn row_of_push(session: &Session, tool: usize, poke: &Poke, near: StrainNear<'_>) -> ToolRow {
     if let Some(point) = poke.point {
-        return row_of_point(session, tool, point);
+        return row_of_point(session, tool, point, near);
     }
     let (tissue, shape) = (session.tissue(), session.model().shape());
     let displacement_m = tissue.surface_displacement_m(poke.centre_m);
@@ -165,12 +180,13 @@ fn row_of_push(session: &Session, tool: usize, poke: &Poke) -> ToolRow {
         is_in_contact: true,
         indentation_m: -displacement_m.dot(shape.normal(shape.nearest(poke.centre_m))),
         disc: None,
+        strain: near(poke.centre_m, 0.0),
     }
 }
 
 /// Returns the row of a force on a point, or of a grasped one.
 #[allow(clippy::cast_possible_truncation)]
-fn row_of_point(session: &Session, tool: usize, point: PointId) -> ToolRow {
+fn row_of_point(session: &Session, tool: usize, point: PointId, near: StrainNear<'_>) -> ToolRow {
     let (state, shape) = (session.tissue().point(point), session.model().shape());
     ToolRow {
         tool: tool as u32,
@@ -179,6 +195,7 @@ fn row_of_point(session: &Session, tool: usize, point: PointId) -> ToolRow {
         is_in_contact: true,
         indentation_m: -state.displacement_m.dot(shape.normal(point)),
         disc: None,
+        strain: near(shape.rest_m(point), 0.0),
     }
 }
 
@@ -193,7 +210,7 @@ mod tests {
     use crate::input::Input;
     use crate::journal::{JournalReader, JournalWriter, Opening, Replay, ReplayEvent, pb};
     use crate::simulation::Simulation;
-    use palpate_exercise::Figure;
+    use palpate_exercise::{Figure, ToolLimits};
     use palpate_tissue::limits::Limits;
 
     fn liver() -> Arc<Model> {
@@ -208,6 +225,12 @@ mod tests {
         figures.iter().find(|figure| figure.definition.name == name && figure.tool == tool).map(|figure| figure.value)
     }
 
+    /// With limits of each kind.
+    fn limited() -> MeasureOptions {
+        let limits = ToolLimits { force_n: Some(0.05), pressure_pa: Some(500.0), strain: Some(0.02) };
+        MeasureOptions { limits, ..MeasureOptions::default() }
+    }
+
     /// Measures a simulation of a script, and calls `record` with what acts at each step.
     fn measured(
         model: &Arc<Model>,
@@ -217,7 +240,7 @@ mod tests {
     ) -> MeasureRecorder {
         let mut simulation = Simulation::playing(model, script, held, &Limits::default()).unwrap();
         let continuous = (!held).then_some(script);
-        let mut recorder = MeasureRecorder::new(model, 0, MeasureOptions::default(), continuous).unwrap();
+        let mut recorder = MeasureRecorder::new(model, 0, limited(), continuous).unwrap();
         for _ in 0..script.steps {
             simulation.take_inputs(0).unwrap();
             record(&simulation);
@@ -263,7 +286,7 @@ mod tests {
         let mut reader = JournalReader::new("measured.mcap", Cursor::new(journal)).unwrap();
         let survey = reader.survey(&mut |_| {}).unwrap();
         let mut replay = Replay::new(reader, survey, &Limits::default()).unwrap();
-        let mut replayed = MeasureRecorder::new(&model, 0, MeasureOptions::default(), None).unwrap();
+        let mut replayed = MeasureRecorder::new(&model, 0, limited(), None).unwrap();
         replay
             .advance(u64::MAX, &mut |event| {
                 if let ReplayEvent::Step(session) = event {
@@ -275,6 +298,16 @@ mod tests {
         let (recorded, replayed) = (recorded.measures().figures(), replayed.measures().figures());
         assert!(recorded.len() > 50, "{}", recorded.len());
         assert_eq!(recorded, replayed);
+        for (name, tool) in [
+            ("peak_strain", Some(0)),
+            ("peak_strain", Some(1)),
+            ("strain_above_limit_share", Some(2)),
+            ("pressure_above_limit_share", Some(2)),
+            ("force_above_limit_share", None),
+        ] {
+            assert!(value(&recorded, name, tool).is_some_and(|value| value > 0.0), "{name} of {tool:?}");
+        }
+        assert_eq!(value(&recorded, "pressure_above_limit_share", Some(1)), Some(0.0));
     }
 
     #[test]

@@ -286,6 +286,11 @@ pub trait Tissue: Send {
     /// [`RestShape::edge_m`](crate::shape::RestShape::edge_m), so that the mean changes smoothly while the
     /// place moves. Without a point there, it is the reaction at the nearest.
     fn reaction_around_n(&self, poke: &Poke) -> DVec3;
+    /// Returns the largest strain at the end of the last step near a place of the rest shape: (L − L₀)/L₀ of what joins two neighbours, one of
+    /// which rests within `radius_m` (m), L₀ the length at rest. It is the strain at which a tissue tears (`[cutting] tear_strain`): of the
+    /// springs between the points of a sheet or a surface, in a solid of the way between the middles of two cubes. What is severed does not
+    /// count; 0 if nothing is stretched.
+    fn strain_around(&self, place_m: DVec3, radius_m: f64) -> f64;
     /// Returns the energies at the end of the last step. It costs about a substep of the awake points; sleeping
     /// tiles use stored values. Earlier calls do not affect the result.
     fn energy(&self) -> Energy;

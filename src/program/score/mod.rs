@@ -9,7 +9,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 use palpate_exercise::timeline::LimitCrossing;
-use palpate_exercise::{Figure, MeasureOptions, Measures};
+use palpate_exercise::{Figure, LimitKind, MeasureOptions, Measures, ToolLimits};
 use palpate_refusal::Refusal;
 use palpate_refusal::printable::{printable, printable_json};
 use serde::{Deserialize, Serialize};
@@ -29,6 +29,13 @@ pub(crate) struct ScoreOptions {
     /// The force, N, above which a tool is too strong: the score then has force_above_limit_share, and each time above it
     #[arg(long, value_name = "N")]
     force_limit_n: Option<f64>,
+    /// The pressure, Pa, above which a tip presses too hard: the score then has pressure_above_limit_share, and each time above it
+    #[arg(long, value_name = "PA")]
+    pressure_limit_pa: Option<f64>,
+    /// The strain, as of `tear_strain` in a scene, above which a tool stretches the tissue near it too far: the score then has peak_strain,
+    /// strain_above_limit_share, and each time above it
+    #[arg(long, value_name = "STRAIN")]
+    strain_limit: Option<f64>,
     /// The pressure, Pa, from which a place of the surface counts as covered. Default: 2000, a fingertip 2 mm deep in a
     /// liver; deep lumps of a breast need 20000
     #[arg(long, value_name = "PA")]
@@ -56,20 +63,31 @@ impl FromStr for HandTools {
 }
 
 impl ScoreOptions {
+    /// Returns the limits that were given.
+    fn limits(&self) -> ToolLimits {
+        ToolLimits { force_n: self.force_limit_n, pressure_pa: self.pressure_limit_pa, strain: self.strain_limit }
+    }
+
     /// Returns the thresholds: those of the options, or else `usual`.
     ///
     /// # Errors
     /// Refuses what [`MeasureOptions::check`] refuses, with the option's name.
     pub(crate) fn checked(&self, usual: MeasureOptions) -> Result<MeasureOptions, Failure> {
         let options = MeasureOptions {
-            force_limit_n: self.force_limit_n.or(usual.force_limit_n),
+            limits: self.limits().or(usual.limits),
             coverage_pa: self.coverage_pa.unwrap_or(usual.coverage_pa),
             press_n: self.press_n.unwrap_or(usual.press_n),
             hands: self.hand.iter().map(|hand| hand.0.clone()).collect(),
             ..usual
         };
         let named = |refusal: Refusal| {
-            let option = if refusal.field == "hands" { "hand".to_owned() } else { refusal.field.replace('_', "-") };
+            let option = match refusal.field.as_str() {
+                "hands" => "hand".to_owned(),
+                "force_n" => "force-limit-n".to_owned(),
+                "pressure_pa" => "pressure-limit-pa".to_owned(),
+                "strain" => "strain-limit".to_owned(),
+                field => field.replace('_', "-"),
+            };
             Refusal { field: format!("--{option}"), ..refusal }
         };
         options.check().map_err(named)?;
@@ -80,6 +98,8 @@ impl ScoreOptions {
     pub(crate) fn given(&self) -> Option<&'static str> {
         let given = [
             ("--force-limit-n", self.force_limit_n.is_some()),
+            ("--pressure-limit-pa", self.pressure_limit_pa.is_some()),
+            ("--strain-limit", self.strain_limit.is_some()),
             ("--coverage-pa", self.coverage_pa.is_some()),
             ("--press-n", self.press_n.is_some()),
             ("--hand", !self.hand.is_empty()),
@@ -112,6 +132,10 @@ pub(crate) struct ScoreSource {
 pub(crate) struct Thresholds {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) force_limit_n: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) pressure_limit_pa: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) strain_limit: Option<f64>,
     pub(crate) coverage_pa: f64,
     pub(crate) press_n: f64,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -132,15 +156,28 @@ pub(crate) struct ScoredMeasure {
     pub(crate) tool: Option<u32>,
 }
 
-/// A time above the limit of force.
+/// A time above a limit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ScoredCrossing {
     pub(crate) tool: u32,
+    /// Its key in the `[limits]` of an exercise, which has the unit of `peak`.
+    pub(crate) limit: String,
     pub(crate) from_step: u64,
     pub(crate) to_step: u64,
     pub(crate) from_s: f64,
     pub(crate) to_s: f64,
-    pub(crate) peak_n: f64,
+    pub(crate) peak: f64,
+}
+
+impl ScoredCrossing {
+    /// Returns the name of the limit and its unit, for people.
+    fn name_and_unit(&self) -> (&str, &'static str) {
+        let known = LimitKind::ALL.into_iter().find(|kind| kind.key() == self.limit);
+        match known {
+            Some(kind) => kind.name_and_unit(),
+            None => (&self.limit, ""),
+        }
+    }
 }
 
 /// A score, as its JSON file has it.
@@ -157,7 +194,7 @@ pub(crate) struct Score {
     pub(crate) thresholds: Thresholds,
     /// All tools together, then each tool.
     pub(crate) measures: Vec<ScoredMeasure>,
-    /// With a limit of force: how often it was exceeded, and the first of these times.
+    /// With limits: how often one was exceeded, and the first of these times.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) limit_crossing_count: Option<u64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -227,12 +264,14 @@ impl Score {
             tool,
         };
         let crossing = |crossing: &LimitCrossing| {
-            let LimitCrossing { tool, steps: [from_step, to_step], peak_n } = *crossing;
+            let LimitCrossing { tool, limit, steps: [from_step, to_step], peak } = *crossing;
             // A row holds for the step that it ends.
             let from_s = from_step.saturating_sub(1) as f64 / rate_hz;
-            ScoredCrossing { tool, from_step, to_step, from_s, to_s: to_step as f64 / rate_hz, peak_n }
+            let limit = limit.key().to_owned();
+            ScoredCrossing { tool, limit, from_step, to_step, from_s, to_s: to_step as f64 / rate_hz, peak }
         };
-        let MeasureOptions { force_limit_n, coverage_pa, press_n, hands, seen_along } = measures.options().clone();
+        let MeasureOptions { limits, coverage_pa, press_n, hands, seen_along } = measures.options().clone();
+        let ToolLimits { force_n: force_limit_n, pressure_pa: pressure_limit_pa, strain: strain_limit } = limits;
         let seen_along = seen_along.map(|direction| direction.to_array());
         let timeline = measures.timeline();
         Score {
@@ -241,9 +280,17 @@ impl Score {
             rate_hz,
             begin_step: measures.begin_step(),
             steps: measures.steps(),
-            thresholds: Thresholds { force_limit_n, coverage_pa, press_n, hands, seen_along },
+            thresholds: Thresholds {
+                force_limit_n,
+                pressure_limit_pa,
+                strain_limit,
+                coverage_pa,
+                press_n,
+                hands,
+                seen_along,
+            },
             measures: figures.iter().copied().map(measure).collect(),
-            limit_crossing_count: force_limit_n.map(|_| timeline.crossing_count()),
+            limit_crossing_count: (limits.given().count() > 0).then(|| timeline.crossing_count()),
             limit_crossings: timeline.crossings().iter().map(crossing).collect(),
             exercise: None,
         }
@@ -303,9 +350,10 @@ impl Score {
             }
         }
         for crossing in &self.limit_crossings {
-            let ScoredCrossing { tool, from_s, to_s, peak_n, .. } = crossing;
-            let peak_n = shown(Some(*peak_n));
-            let _ = writeln!(text, "above the limit of force: tool {tool}, {from_s:.3} s to {to_s:.3} s, {peak_n} N");
+            let ScoredCrossing { tool, from_s, to_s, peak, .. } = crossing;
+            let ((name, unit), peak) = (crossing.name_and_unit(), shown(Some(*peak)));
+            let _ =
+                writeln!(text, "above the limit of {name}: tool {tool}, {from_s:.3} s to {to_s:.3} s, {peak}{unit}");
         }
         text
     }

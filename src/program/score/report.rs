@@ -117,6 +117,8 @@ fn about(score: &Score) -> String {
     parts.extend(score.source.recorded.as_ref().map(|recorded| format!("recorded {recorded} UTC")));
     let thresholds = &score.thresholds;
     parts.extend(thresholds.force_limit_n.map(|limit_n| format!("limit of force {limit_n} N")));
+    parts.extend(thresholds.pressure_limit_pa.map(|limit_pa| format!("limit of pressure {limit_pa} Pa")));
+    parts.extend(thresholds.strain_limit.map(|limit| format!("limit of strain {limit}")));
     parts.push(format!("a press begins at {} N", thresholds.press_n));
     parts.push(format!("a place is covered from {} Pa on", thresholds.coverage_pa));
     parts.join(" · ")
@@ -209,12 +211,14 @@ fn curves(score: &Score, timeline: &Timeline) -> String {
 
 fn crossings(score: &Score) -> String {
     let Some(count) = score.limit_crossing_count else { return String::new() };
-    let mut html = "<h2>Above the limit of force</h2>\n".to_owned();
+    let mut html = "<h2>Above the limits</h2>\n".to_owned();
     if count == 0 {
         return html + "<p>Never.</p>\n";
     }
-    html += "<table><tr><th>tool</th><th>from, s</th><th>to, s</th><th>largest force, N</th><th>look at it</th></tr>\n";
-    for ScoredCrossing { tool, from_s, to_s, from_step, peak_n, .. } in score.limit_crossings.iter().take(MAX_ROWS) {
+    html += "<table><tr><th>limit of</th><th>tool</th><th>from, s</th><th>to, s</th><th>most</th><th>look at it</th></tr>\n";
+    for crossing in score.limit_crossings.iter().take(MAX_ROWS) {
+        let ScoredCrossing { tool, from_s, to_s, from_step, peak, .. } = crossing;
+        let (name, unit) = crossing.name_and_unit();
         let look = score.source.journal.as_ref().map_or_else(
             || format!("step {from_step}"),
             |journal| {
@@ -223,8 +227,9 @@ fn crossings(score: &Score) -> String {
         );
         let _ = writeln!(
             html,
-            "<tr><td>{tool}</td><td>{from_s:.3}</td><td>{to_s:.3}</td><td>{}</td><td>{look}</td></tr>",
-            shown(Some(*peak_n))
+            "<tr><td>{}</td><td>{tool}</td><td>{from_s:.3}</td><td>{to_s:.3}</td><td>{}{unit}</td><td>{look}</td></tr>",
+            escaped(name),
+            shown(Some(*peak))
         );
     }
     html += "</table>\n";

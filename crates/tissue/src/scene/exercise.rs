@@ -144,6 +144,10 @@ pub struct CoverageTask {
 pub struct ExerciseLimits {
     /// Force of one tool, N.
     pub force_n: Option<f64>,
+    /// Mean pressure under a tip, Pa.
+    pub pressure_pa: Option<f64>,
+    /// Strain of the tissue near a tool ([`Tissue::strain_around`](crate::Tissue::strain_around)).
+    pub strain: Option<f64>,
 }
 
 /// A measure in a score.

@@ -207,7 +207,11 @@ fn coverage(fields: &mut Fields<'_>) -> Result<CoverageTask> {
 }
 
 fn limits(fields: &mut Fields<'_>) -> Result<ExerciseLimits> {
-    Ok(ExerciseLimits { force_n: positive_or_none(fields, "force_n")? })
+    Ok(ExerciseLimits {
+        force_n: positive_or_none(fields, "force_n")?,
+        pressure_pa: positive_or_none(fields, "pressure_pa")?,
+        strain: positive_or_none(fields, "strain")?,
+    })
 }
 
 fn trainee(fields: &mut Fields<'_>) -> Result<TraineeView> {

@@ -358,6 +358,10 @@ impl<T: Real> Tissue for TissueState<T> {
         }
     }
 
+    fn strain_around(&self, place_m: DVec3, radius_m: f64) -> f64 {
+        self.largest_strain(self.model.shape().around(place_m, radius_m))
+    }
+
     fn energy(&self) -> Energy {
         let TissueState { model, plan, tables, state, tiles, .. } = self;
         let (_, mut energy, _) = self.survey(&tiles.region);

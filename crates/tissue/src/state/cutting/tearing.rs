@@ -1,4 +1,4 @@
-//! Tears: the springs that a step has stretched too far.
+//! Tears: the springs that a step has stretched too far, and how far springs are stretched.
 //!
 //! A spring tears beyond the strain that the scene gives (`[cutting] tear_strain`), counted from the length at which the scene has it at
 //! rest. Only springs between neighbours tear, and in a step only the most strained one of each point, relative to its limit: what is
@@ -16,6 +16,7 @@ use super::Crossing;
 use crate::body::spring_ends::SpringEnd;
 use crate::kernel::real::Real;
 use crate::kernel::region::sides_of;
+use crate::shape::PointId;
 use crate::state::tissue_state::TissueState;
 
 impl<T: Real> TissueState<T> {
@@ -81,6 +82,25 @@ impl<T: Real> TissueState<T> {
         found
     }
 
+    /// Returns the largest strain of the whole springs between neighbours that end at one of some points; 0 if none is stretched.
+    pub(in crate::state) fn largest_strain(&self, points: Vec<PointId>) -> f64 {
+        let TissueState { model, tables, .. } = self;
+        let u_m = |place: usize| self.end_motion_m(place)[0];
+        let mut largest = 0.0;
+        for place in points.into_iter().map(|point| model.place_of(point)).filter(|place| model.is_spring_end(*place)) {
+            let (own_m, first_end) = (u_m(place), model.first_end(place));
+            model.each_spring(place, |spring| {
+                let stretch = stretch(model.unit_m * spring.rest, u_m(spring.other) - own_m);
+                let is_whole =
+                    || !tables.severed.has(first_end + spring.number) && model.joins_neighbours(place, &spring);
+                if stretch > largest && is_whole() {
+                    largest = stretch;
+                }
+            });
+        }
+        strain_of(largest)
+    }
+
     /// Returns the whole springs that resist bending and whose ends no two whole springs in a row join, once `torn` are severed.
     pub(super) fn unspanned(&self, torn: &[Crossing]) -> Vec<Crossing> {
         let TissueState { model, tables, .. } = self;
@@ -114,12 +134,23 @@ impl<T: Real> TissueState<T> {
 /// Returns the strain of a spring divided by its limit, if it is beyond that; `limit` gives it for a length at rest, m.
 #[inline]
 fn excess(rest_m: DVec3, delta_m: DVec3, limit: impl Fn(f64) -> Option<f64>) -> Option<f64> {
-    let length_m = rest_m.length();
-    let limit = limit(length_m)?;
-    // L² − L0², without cancellation (`kernel::springs`).
-    let stretch = (2.0 * rest_m + delta_m).dot(delta_m) / (length_m * length_m);
+    let limit = limit(rest_m.length())?;
+    let stretch = stretch(rest_m, delta_m);
     // Its root is taken of springs beyond the limit alone.
-    (stretch > limit * (2.0 + limit)).then(|| stretch / (1.0 + (1.0 + stretch).sqrt()) / limit)
+    (stretch > limit * (2.0 + limit)).then(|| strain_of(stretch) / limit)
+}
+
+/// Returns (L² − L₀²)/L₀² of a spring, without cancellation (`kernel::springs`): it grows with the strain.
+#[inline]
+fn stretch(rest_m: DVec3, delta_m: DVec3) -> f64 {
+    let length_m = rest_m.length();
+    (2.0 * rest_m + delta_m).dot(delta_m) / (length_m * length_m)
+}
+
+/// Returns the strain (L − L₀)/L₀ of a [`stretch`].
+#[inline]
+fn strain_of(stretch: f64) -> f64 {
+    stretch / (1.0 + (1.0 + stretch).sqrt())
 }
 
 #[cfg(test)]

@@ -97,6 +97,48 @@ fn a_tear_starts_at_the_stated_strain_whatever_the_mesh() {
     }
 }
 
+/// Stretches a cube of cells by the part `LED` along z until `LED_S`, by the points of its rim.
+fn stretch_cube(model: &Model, side_m: f64, tissue: &mut dyn Tissue) {
+    let is_rim = |at_m: DVec3| at_m.min_element() < 1e-9 || at_m.max_element() > side_m - 1e-9;
+    let rim = model.points().filter(|point| is_rim(model.shape().rest_m(*point)) && !model.shape().is_fixed(*point));
+    for (tool, point) in rim.enumerate() {
+        let by_m = LED * model.shape().rest_m(point).z * DVec3::Z;
+        let moves = vec![Move { from_s: 0.0, to_s: LED_S, by_m }];
+        tissue.grasp(tool, point, Grasp::Profile(MotionProfile { point, moves }));
+    }
+}
+
+#[test]
+fn the_strain_around_a_place_is_that_of_an_even_stretch_in_each_kind_of_tissue() {
+    let side_m = 0.016;
+    for (kind, model) in [
+        ("sheet", square("sheet", 8, false, "")),
+        ("surface", square("surface", 8, false, "")),
+        ("solid", cube_of(4, side_m / 4.0, &[])),
+    ] {
+        let mut tissue = at_rest(&model);
+        match kind {
+            "solid" => stretch_cube(&model, side_m, &mut *tissue),
+            _ => stretch(&model, &mut *tissue),
+        }
+        let middle_m = model.shape().extent().middle_m();
+        let reach_m = 2.0 * model.shape().edge_m();
+        assert_eq!(tissue.strain_around(middle_m, reach_m), 0.0, "{kind}");
+        let steps = (0.5 * LED_S * model.scene.stepping.rate_hz) as u64;
+        (0..steps).for_each(|_| tissue.step().unwrap());
+        let (found, expected) = (tissue.strain_around(middle_m, reach_m), strain(0.5 * LED_S));
+        // Near the led rim: the middle follows a little later.
+        let at_rim = tissue.strain_around(DVec3::ZERO, reach_m);
+        println!("{kind}: {found:.6} in the middle, {at_rim:.6} at the rim, {expected:.6} expected");
+        assert!((found / expected - 1.0).abs() < 0.01, "{kind}: {found} instead of {expected}");
+        while tissue.step_count() < (1.25 * LED_S * model.scene.stepping.rate_hz) as u64 {
+            tissue.step().unwrap();
+        }
+        let rested = tissue.strain_around(middle_m, reach_m);
+        assert!((rested - LED).abs() < 1e-3 * LED, "{kind}: {rested} instead of {LED}");
+    }
+}
+
 #[test]
 fn a_tear_in_a_solid_starts_at_the_stated_strain_whatever_the_size_of_its_cells() {
     let side_m = 0.016;
@@ -106,17 +148,7 @@ fn a_tear_in_a_solid_starts_at_the_stated_strain_whatever_the_size_of_its_cells(
         sets.extend(reference.map(|edge_m: f64| format!("cutting.tear_reference_m={edge_m}")));
         let model = cube_of(cells as usize, edge_m, &sets.iter().map(String::as_str).collect::<Vec<_>>());
         let mut tissue = at_rest(&model);
-        let is_rim = |at_m: DVec3| at_m.min_element() < 1e-9 || at_m.max_element() > side_m - 1e-9;
-        let rim =
-            model.points().filter(|point| is_rim(model.shape().rest_m(*point)) && !model.shape().is_fixed(*point));
-        for (tool, point) in rim.enumerate() {
-            let by_m = LED * model.shape().rest_m(point).z * DVec3::Z;
-            tissue.grasp(
-                tool,
-                point,
-                Grasp::Profile(MotionProfile { point, moves: vec![Move { from_s: 0.0, to_s: LED_S, by_m }] }),
-            );
-        }
+        stretch_cube(&model, side_m, &mut *tissue);
         let rate_hz = model.scene.stepping.rate_hz;
         while tissue.cuts().is_empty() && tissue.step_count() < (LED_S * rate_hz) as u64 {
             tissue.step().unwrap();
