@@ -36,7 +36,7 @@ pub struct Input {
     #[prost(uint64, tag = "1")]
     pub step: u64,
     /// The kind of input.
-    #[prost(oneof = "input::What", tags = "2, 3, 4, 5, 6, 7, 8, 9")]
+    #[prost(oneof = "input::What", tags = "2, 3, 4, 5, 6, 7, 8, 9, 10")]
     pub what: ::core::option::Option<input::What>,
 }
 /// Nested message and enum types in `Input`.
@@ -60,6 +60,8 @@ pub mod input {
         Hold(super::Hold),
         #[prost(message, tag = "9")]
         ExerciseResult(super::ExerciseResult),
+        #[prost(message, tag = "10")]
+        PhaseEnd(super::PhaseEnd),
     }
 }
 impl ::prost::Name for Input {
@@ -440,6 +442,23 @@ impl ::prost::Name for Hold {
         "/palpate.journal.v1.Hold".into()
     }
 }
+/// The trainee has ended a phase of the session's exercise before its time: the next one begins. It changes nothing.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct PhaseEnd {
+    /// From 1.
+    #[prost(uint32, tag = "1")]
+    pub phase: u32,
+}
+impl ::prost::Name for PhaseEnd {
+    const NAME: &'static str = "PhaseEnd";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.PhaseEnd".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.PhaseEnd".into()
+    }
+}
 /// The result of the session's exercise: it has ended before this input. It changes nothing.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ExerciseResult {
@@ -451,6 +470,18 @@ pub struct ExerciseResult {
     /// Absent for an exercise without criteria.
     #[prost(double, optional, tag = "3")]
     pub score_percent: ::core::option::Option<f64>,
+    /// Number of steps done when it began.
+    #[prost(uint64, tag = "4")]
+    pub begin_step: u64,
+    /// What each criterion of the exercise earned, in its order.
+    #[prost(message, repeated, tag = "5")]
+    pub criteria: ::prost::alloc::vec::Vec<EarnedCriterion>,
+    /// What was marked.
+    #[prost(message, repeated, tag = "6")]
+    pub answers: ::prost::alloc::vec::Vec<GivenAnswer>,
+    /// The phases that had begun; empty for an exercise of one piece.
+    #[prost(message, repeated, tag = "7")]
+    pub phases: ::prost::alloc::vec::Vec<PhaseResult>,
 }
 impl ::prost::Name for ExerciseResult {
     const NAME: &'static str = "ExerciseResult";
@@ -460,6 +491,67 @@ impl ::prost::Name for ExerciseResult {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.ExerciseResult".into()
+    }
+}
+/// What a criterion of an exercise has earned.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct EarnedCriterion {
+    /// Absent: the measure has no value.
+    #[prost(double, optional, tag = "1")]
+    pub value: ::core::option::Option<f64>,
+    /// The earned part of the weight, 0 to 1.
+    #[prost(double, tag = "2")]
+    pub earned: f64,
+}
+impl ::prost::Name for EarnedCriterion {
+    const NAME: &'static str = "EarnedCriterion";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.EarnedCriterion".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.EarnedCriterion".into()
+    }
+}
+/// A place that a trainee marked.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct GivenAnswer {
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    #[prost(uint32, tag = "2")]
+    pub tool: u32,
+    #[prost(message, optional, tag = "3")]
+    pub mark: ::core::option::Option<Mark>,
+}
+impl ::prost::Name for GivenAnswer {
+    const NAME: &'static str = "GivenAnswer";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.GivenAnswer".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.GivenAnswer".into()
+    }
+}
+/// What was measured in a phase of an exercise.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct PhaseResult {
+    /// Number of steps done at its beginning and at its end.
+    #[prost(uint64, tag = "1")]
+    pub begin_step: u64,
+    #[prost(uint64, tag = "2")]
+    pub step: u64,
+    #[prost(message, repeated, tag = "3")]
+    pub figures: ::prost::alloc::vec::Vec<Figure>,
+}
+impl ::prost::Name for PhaseResult {
+    const NAME: &'static str = "PhaseResult";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.PhaseResult".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.PhaseResult".into()
     }
 }
 /// The value of a measure.

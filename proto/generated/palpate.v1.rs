@@ -250,6 +250,9 @@ pub struct Exercise {
     /// The strain of the tissue near a tool that none may exceed.
     #[prost(double, optional, tag = "16")]
     pub strain_limit: ::core::option::Option<f64>,
+    /// Its phases, one after the other; empty for an exercise of one piece.
+    #[prost(message, repeated, tag = "17")]
+    pub phases: ::prost::alloc::vec::Vec<ExercisePhase>,
 }
 impl ::prost::Name for Exercise {
     const NAME: &'static str = "Exercise";
@@ -259,6 +262,28 @@ impl ::prost::Name for Exercise {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.Exercise".into()
+    }
+}
+/// A part of an exercise that is measured for itself.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ExercisePhase {
+    #[prost(string, tag = "1")]
+    pub title: ::prost::alloc::string::String,
+    /// What the trainee is asked to do in it.
+    #[prost(string, tag = "2")]
+    pub instructions: ::prost::alloc::string::String,
+    /// The simulated time after which the next one begins; absent: when the trainee goes on (FinishExercise).
+    #[prost(double, optional, tag = "3")]
+    pub time_limit_s: ::core::option::Option<f64>,
+}
+impl ::prost::Name for ExercisePhase {
+    const NAME: &'static str = "ExercisePhase";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ExercisePhase".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ExercisePhase".into()
     }
 }
 /// A line on the surface at rest.
@@ -390,6 +415,12 @@ pub struct WatchExerciseResponse {
     /// Set once it has ended: this is the last message.
     #[prost(message, optional, tag = "6")]
     pub result: ::core::option::Option<ExerciseResult>,
+    /// The phase that goes on, from 1; 0 for an exercise of one piece.
+    #[prost(uint32, tag = "7")]
+    pub phase: u32,
+    /// Simulated time since that phase began.
+    #[prost(double, tag = "8")]
+    pub phase_time_s: f64,
 }
 impl ::prost::Name for WatchExerciseResponse {
     const NAME: &'static str = "WatchExerciseResponse";
@@ -450,6 +481,9 @@ pub struct ExerciseResult {
     /// What was marked.
     #[prost(message, repeated, tag = "8")]
     pub answers: ::prost::alloc::vec::Vec<GivenAnswer>,
+    /// The phases that had begun; empty for an exercise of one piece.
+    #[prost(message, repeated, tag = "9")]
+    pub phases: ::prost::alloc::vec::Vec<PhaseResult>,
 }
 impl ::prost::Name for ExerciseResult {
     const NAME: &'static str = "ExerciseResult";
@@ -459,6 +493,30 @@ impl ::prost::Name for ExerciseResult {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.ExerciseResult".into()
+    }
+}
+/// What was measured in a phase.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct PhaseResult {
+    /// Number of steps done at its beginning and at its end.
+    #[prost(uint64, tag = "1")]
+    pub begin_step: u64,
+    #[prost(uint64, tag = "2")]
+    pub step: u64,
+    /// Simulated time that it took.
+    #[prost(double, tag = "3")]
+    pub time_s: f64,
+    #[prost(message, repeated, tag = "4")]
+    pub figures: ::prost::alloc::vec::Vec<Figure>,
+}
+impl ::prost::Name for PhaseResult {
+    const NAME: &'static str = "PhaseResult";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.PhaseResult".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.PhaseResult".into()
     }
 }
 /// What a criterion of the score has earned.
@@ -479,6 +537,9 @@ pub struct EarnedCriterion {
     /// The earned part of the weight, 0 to 1.
     #[prost(double, tag = "6")]
     pub earned: f64,
+    /// The phase whose figure counts, from 1; 0: that of the whole exercise.
+    #[prost(uint32, tag = "7")]
+    pub phase: u32,
 }
 impl ::prost::Name for EarnedCriterion {
     const NAME: &'static str = "EarnedCriterion";
@@ -560,6 +621,10 @@ impl ::prost::Name for Advice {
 pub struct FinishExerciseRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
+    /// Ends only this phase (from 1), unless it has ended; the last one ends the exercise. Refused: a phase that has not begun
+    /// (OUT_OF_TURN). 0: the whole exercise.
+    #[prost(uint32, tag = "2")]
+    pub phase: u32,
 }
 impl ::prost::Name for FinishExerciseRequest {
     const NAME: &'static str = "FinishExerciseRequest";
@@ -573,6 +638,7 @@ impl ::prost::Name for FinishExerciseRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FinishExerciseResponse {
+    /// Absent while the exercise goes on with its next phase.
     #[prost(message, optional, tag = "1")]
     pub result: ::core::option::Option<ExerciseResult>,
 }
@@ -786,7 +852,7 @@ pub mod exercise_service_client {
                 .insert(GrpcMethod::new("palpate.v1.ExerciseService", "WatchExercise"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Ends a session's exercise now, unless it has ended, and returns its result. The session goes on.
+        /// Ends a session's exercise now, unless it has ended, and returns its result; or ends a phase of it. The session goes on.
         pub async fn finish_exercise(
             &mut self,
             request: impl tonic::IntoRequest<super::FinishExerciseRequest>,
@@ -875,7 +941,7 @@ pub mod exercise_service_server {
             tonic::Response<Self::WatchExerciseStream>,
             tonic::Status,
         >;
-        /// Ends a session's exercise now, unless it has ended, and returns its result. The session goes on.
+        /// Ends a session's exercise now, unless it has ended, and returns its result; or ends a phase of it. The session goes on.
         async fn finish_exercise(
             &self,
             request: tonic::Request<super::FinishExerciseRequest>,

@@ -69,6 +69,9 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
         let (name, unit) = kind.name_and_unit();
         format!("{name} at most {limit}{unit}")
     }));
+    if !exercise.phases.is_empty() {
+        parts.push(of(exercise.phases.len(), "phase"));
+    }
     let weight: f64 = exercise.criteria.iter().map(|criterion| criterion.weight).sum();
     parts.push(format!(
         "{} of weight {weight} in all",

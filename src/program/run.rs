@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use palpate_realtime::clock::now_ns;
 use palpate_session::Session;
+use palpate_session::journal::exercise::ExerciseEvents;
 use palpate_session::run::{RunEvent, RunOptions, run_observed, write_event};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
@@ -85,7 +86,7 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let mut recorder = match &arguments.score {
         Some(_) => {
             let continuous = (!arguments.held).then_some(&script);
-            Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), None))?)
+            Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), ExerciseEvents::default()))?)
         }
         None => None,
     };

@@ -3,11 +3,11 @@
 use palpate_exercise::{Figure, register};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
-use palpate_realtime::{EndedExercise, LiveExercise, TrainerAdvice};
+use palpate_realtime::{LiveExercise, TrainerAdvice};
 use palpate_session::RecordedMark;
-use palpate_session::exercise_judge::{EarnedCriterion, thresholds};
-use palpate_session::measured_run::MomentFigures;
-use palpate_tissue::scene::exercise::{AvoidedRegion, CutLine, Exercise, Lump};
+use palpate_session::exercise_judge::{EarnedCriterion, PhaseFigures, thresholds};
+use palpate_session::measured_run::{EndedExercise, MomentFigures};
+use palpate_tissue::scene::exercise::{AvoidedRegion, CutLine, Exercise, ExercisePhase, Lump};
 
 /// Returns what everybody may know of an exercise.
 pub(super) fn exercise(exercise: &Exercise) -> pb::Exercise {
@@ -16,6 +16,11 @@ pub(super) fn exercise(exercise: &Exercise) -> pb::Exercise {
         within_m: line.within_m,
     };
     let ball = |ball: &AvoidedRegion| pb::ExerciseBall { centre_m: vector(ball.centre_m), radius_m: ball.radius_m };
+    let phase = |phase: &ExercisePhase| pb::ExercisePhase {
+        title: phase.title.clone(),
+        instructions: phase.instructions.clone(),
+        time_limit_s: phase.time_limit_s,
+    };
     let options = thresholds(exercise);
     pb::Exercise {
         name: exercise.name.clone(),
@@ -37,6 +42,7 @@ pub(super) fn exercise(exercise: &Exercise) -> pb::Exercise {
             .map(|definition| definition.name.to_owned())
             .collect(),
         tells_result: exercise.trainee.sees_result,
+        phases: exercise.phases.iter().map(phase).collect(),
     }
 }
 
@@ -73,9 +79,10 @@ fn figures<'f>(figures: impl Iterator<Item = &'f Figure>) -> Vec<pb::Figure> {
     figures.map(figure).collect()
 }
 
+/// Returns the simulated time between two steps, s.
 #[allow(clippy::cast_precision_loss)]
-fn time_s(live: &LiveExercise, step: u64) -> f64 {
-    step.saturating_sub(live.begin_step) as f64 / live.plain.scene.stepping.rate_hz
+fn time_s(live: &LiveExercise, begin_step: u64, step: u64) -> f64 {
+    step.saturating_sub(begin_step) as f64 / live.plain.scene.stepping.rate_hz
 }
 
 /// Returns the figures of a moment.
@@ -84,17 +91,19 @@ pub(super) fn moment(live: &LiveExercise, moment: &MomentFigures, is_trainee: bo
     let told = |figure: &&Figure| !is_trainee || is_live(exercise, figure.definition.name);
     pb::WatchExerciseResponse {
         step: moment.step,
-        time_s: time_s(live, moment.step),
+        time_s: time_s(live, live.begin_step, moment.step),
         figures: figures(moment.figures.iter().filter(told)),
         score_percent: moment.score.as_ref().filter(|_| !is_trainee).map(|score| score.percent),
+        phase: u32::try_from(moment.phases.len()).unwrap_or(u32::MAX),
+        phase_time_s: moment.phases.last().map_or(0.0, |phase| time_s(live, phase.steps[0], moment.step)),
         ..Default::default()
     }
 }
 
 /// Returns the result of an exercise.
 pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: bool) -> pb::ExerciseResult {
-    let MomentFigures { step, figures: all, score } = &*ended.figures;
-    let brief = pb::ExerciseResult { step: *step, time_s: time_s(live, *step), ..Default::default() };
+    let MomentFigures { step, figures: all, phases, score } = &ended.figures;
+    let brief = pb::ExerciseResult { step: *step, time_s: time_s(live, ended.begin_step, *step), ..Default::default() };
     if is_trainee && !live.chosen.exercise.trainee.sees_result {
         return brief;
     }
@@ -105,6 +114,7 @@ pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: boo
         good: earned.criterion.good,
         value: earned.value,
         earned: earned.part,
+        phase: earned.criterion.phase.unwrap_or(0),
     };
     let lump = |lump: &Lump| pb::HiddenLump {
         centre_m: vector(lump.centre_m),
@@ -117,6 +127,12 @@ pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: boo
         place_m: vector(answer.mark.place_m),
         diameter_m: answer.mark.diameter_m,
     };
+    let phase = |phase: &PhaseFigures| pb::PhaseResult {
+        begin_step: phase.steps[0],
+        step: phase.steps[1],
+        time_s: time_s(live, phase.steps[0], phase.steps[1]),
+        figures: figures(phase.figures.iter()),
+    };
     pb::ExerciseResult {
         is_told: true,
         figures: figures(all.iter()),
@@ -124,6 +140,7 @@ pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: boo
         criteria: score.iter().flat_map(|score| score.criteria.iter().map(criterion)).collect(),
         lumps: live.chosen.lumps.iter().map(lump).collect(),
         answers: ended.answers.iter().map(answer).collect(),
+        phases: phases.iter().map(phase).collect(),
         ..brief
     }
 }

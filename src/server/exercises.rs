@@ -95,11 +95,15 @@ impl NewsStream {
         let news = self.news.borrow_and_update().clone();
         let live = &self.live;
         let measured = news.measured.as_deref().map(|figures| moment(live, figures, self.is_trainee));
-        let message = pb::WatchExerciseResponse {
+        let mut message = pb::WatchExerciseResponse {
             advice: news.advice.iter().filter(|advice| advice.number > self.advised).map(advice).collect(),
             result: news.ended.as_deref().map(|ended| result(live, ended, self.is_trainee)),
             ..measured.unwrap_or_else(|| pb::WatchExerciseResponse { step: live.begin_step, ..Default::default() })
         };
+        // A phase has begun since these figures.
+        if message.phase < news.phase {
+            (message.phase, message.phase_time_s) = (news.phase, 0.0);
+        }
         if news.ended.is_some() {
             return Some((Ok(message), None));
         }
@@ -145,10 +149,15 @@ impl ExerciseService for Exercises {
         &self,
         request: Request<pb::FinishExerciseRequest>,
     ) -> Result<Response<pb::FinishExerciseResponse>, Status> {
-        let seat = self.0.seat("FinishExercise", &request.get_ref().session_id).await?;
-        let ended = seat.handle.finish_exercise().await?;
-        let result = result(seat.handle.live_exercise()?, &ended, seat.trainee.is_some());
-        Ok(Response::new(pb::FinishExerciseResponse { result: Some(result) }))
+        let pb::FinishExerciseRequest { session_id, phase } = request.get_ref();
+        let seat = self.0.seat("FinishExercise", session_id).await?;
+        let ended = match phase {
+            0 => Some(seat.handle.finish_exercise().await?),
+            phase => seat.handle.finish_phase(*phase).await?,
+        };
+        let live = seat.handle.live_exercise()?;
+        let result = ended.map(|ended| result(live, &ended, seat.trainee.is_some()));
+        Ok(Response::new(pb::FinishExerciseResponse { result }))
     }
 
     async fn advise_trainee(

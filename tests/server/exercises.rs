@@ -79,8 +79,13 @@ async fn all(mut watched: Watched) -> Vec<pb::WatchExerciseResponse> {
 }
 
 async fn finish(server: &TestServer, session_id: &str) -> pb::ExerciseResult {
-    let request = pb::FinishExerciseRequest { session_id: session_id.to_owned() };
-    exercises(server).await.finish_exercise(request).await.unwrap().into_inner().result.unwrap()
+    end(server, session_id, 0).await.unwrap().unwrap()
+}
+
+/// Ends a phase, or the whole exercise (0).
+async fn end(server: &TestServer, session_id: &str, phase: u32) -> Result<Option<pb::ExerciseResult>, tonic::Status> {
+    let request = pb::FinishExerciseRequest { session_id: session_id.to_owned(), phase };
+    exercises(server).await.finish_exercise(request).await.map(|finished| finished.into_inner().result)
 }
 
 /// The figures by name and tool, as bits.
@@ -283,10 +288,84 @@ async fn an_exercise_of_a_client_is_read_and_what_is_wrong_is_named() {
     assert_eq!(told(&server.create(unknown, false).await.unwrap_err()).1, "UNKNOWN_EXERCISE");
     let listed = exercises(&server).await.list_exercises(pb::ListExercisesRequest {}).await.unwrap().into_inner();
     let names: Vec<&str> = listed.exercises.iter().map(|exercise| exercise.name.as_str()).collect();
-    assert_eq!(names, ["close-wound", "cut-line", "lift-hold", "lumps-1", "lumps-2", "lumps-3", "palpate-all"]);
+    assert_eq!(
+        names,
+        ["close-wound", "cut-line", "lift-hold", "lumps-1", "lumps-2", "lumps-3", "palpate-all", "search-mark"]
+    );
     let paper = server.paper(false).await;
     let watched = exercises(&server).await.watch_exercise(pb::WatchExerciseRequest { session_id: paper }).await;
     assert_eq!(told(&watched.err().unwrap()).1, "UNKNOWN_EXERCISE");
+}
+
+/// Two phases: the first one goes on until the trainee ends it, the second one for 0.3 s.
+fn phased() -> Source {
+    let criterion = |measure: &str, phase: u32| {
+        format!("[[criterion]]\nmeasure = \"{measure}\"\nphase = {phase}\npoor = 0\ngood = 1\n")
+    };
+    let text = format!(
+        "name = \"mine\"\ninstructions = \"Press, then rest.\"\nscenes = [\"phantom\"]\n\
+         [[phase]]\ntitle = \"Press\"\ninstructions = \"Press.\"\n\
+         [[phase]]\ntitle = \"Rest\"\ninstructions = \"Rest.\"\ntime_limit_s = 0.3\n{}{}",
+        criterion("press_count", 1),
+        criterion("coverage_share", 2)
+    );
+    let source = Some(pb::chosen_exercise::Source::Text(text));
+    Source::Exercise(pb::ChosenExercise { source, ..Default::default() })
+}
+
+#[tokio::test]
+async fn phases_end_by_the_trainee_or_by_their_time_and_the_journal_gives_their_figures() {
+    let folder = tempfile::tempdir().unwrap();
+    let journals = folder.path().join("journals");
+    let server = TestServer::start_patiently(folder.path(), &format!("journal = {journals:?}"), "");
+    let session = server.create(phased(), false).await.unwrap();
+    let told_exercise = session.exercise.clone().unwrap();
+    let phases = told_exercise.exercise.unwrap().phases;
+    assert_eq!((phases.len(), phases[1].title.as_str(), phases[1].time_limit_s), (2, "Rest", Some(0.3)));
+    let (session_id, trainee_id) = (session.session_id, told_exercise.trainee_id);
+    let watched = tokio::spawn(all(watch(&server, &trainee_id).await));
+    press_and_mark(&server, &trainee_id).await;
+    for (phase, reason) in [(2, "OUT_OF_TURN"), (3, "OUT_OF_RANGE")] {
+        let (_, told_reason, field) = told(&end(&server, &trainee_id, phase).await.unwrap_err());
+        assert_eq!((told_reason.as_str(), field.as_str()), (reason, "phase"));
+    }
+    assert_eq!(end(&server, &trainee_id, 1).await.unwrap(), None);
+    let messages = watched.await.unwrap();
+    let result = messages.last().unwrap().result.clone().unwrap();
+    let numbers: BTreeSet<u32> = messages.iter().map(|message| message.phase).filter(|phase| *phase > 0).collect();
+    assert_eq!(numbers, BTreeSet::from([1, 2]));
+    let [press, rest] = &result.phases[..] else { panic!("{result:?}") };
+    assert_eq!((press.begin_step, rest.begin_step, rest.step), (0, press.step, press.step + 300));
+    assert_eq!((result.step, rest.time_s), (rest.step, 0.3));
+    let value = |figures: &[pb::Figure], name: &str| {
+        figures.iter().find(|figure| figure.measure == name && figure.tool.is_none()).unwrap().value
+    };
+    assert!(value(&press.figures, "press_count") >= 1.0 && value(&rest.figures, "press_count") == 0.0);
+    let times_s = [&press.figures, &rest.figures].map(|figures| value(figures, "time_s"));
+    assert!((times_s[0] + times_s[1] - result.time_s).abs() < 1e-9, "{times_s:?}");
+    // A press has earned its half; nothing was done in the second phase.
+    let earned: Vec<(u32, f64)> = result.criteria.iter().map(|criterion| (criterion.phase, criterion.earned)).collect();
+    assert_eq!((earned, result.score_percent), (vec![(1, 1.0), (2, 0.0)], Some(50.0)));
+    // What has ended stays ended.
+    assert_eq!(end(&server, &session_id, 1).await.unwrap().as_ref(), Some(&result));
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: session_id.clone() }).await.unwrap();
+    let (_, json) = score(&journals.join(format!("{session_id}.1.mcap")), &[]).unwrap();
+    for (told, phase) in json["exercise"]["phases"].as_array().unwrap().iter().zip(&result.phases) {
+        assert_eq!(
+            (told["begin_step"].as_u64(), told["steps"].as_u64()),
+            (Some(phase.begin_step), Some(phase.step - phase.begin_step))
+        );
+        let scored = told["measures"].as_array().unwrap();
+        assert_eq!(scored.len(), phase.figures.len());
+        for (scored, figure) in scored.iter().zip(&phase.figures) {
+            let value = scored["value"].as_f64().unwrap();
+            assert!(
+                scored["name"] == figure.measure.as_str() && (value - figure.value).abs() <= 1e-12 * value.abs(),
+                "{scored} {figure:?}"
+            );
+        }
+    }
+    assert_eq!(json["exercise"]["score_percent"].as_f64(), Some(50.0));
 }
 
 #[tokio::test]
@@ -316,8 +395,8 @@ async fn after_a_crash_a_session_has_its_exercise_its_ids_and_its_result() {
     assert!(seen.scene.unwrap().inclusions.is_empty() && seen.exercise.unwrap().finished);
     let save = server.sessions().await.save_snapshot(pb::SaveSnapshotRequest { session_id: trainee_id.clone() }).await;
     assert_eq!(told(&save.err().unwrap()).1, "NOT_FOR_TRAINEE");
-    let told_again = finish(&server, &session_id).await;
-    assert_eq!((told_again.step, bits(&told_again.figures)), (result.step, bits(&result.figures)));
-    assert_eq!((told_again.score_percent, told_again.lumps), (result.score_percent, result.lumps));
+    // With its time, what the criteria earned, and the answers.
+    assert!(result.time_s > 0.0 && !result.criteria.is_empty() && result.answers.len() == 1, "{result:?}");
+    assert_eq!(finish(&server, &session_id).await, result);
     assert_eq!(server.status(&session_id).await.exercise.unwrap().seed, Some(3));
 }

@@ -31,7 +31,7 @@ async fn one(server: &TestServer, level: &str, kind: TraineeKind, seed: u64) -> 
     let trainee_id = session.exercise.unwrap().trainee_id;
     let channel = Server::new(&server.url, &Credentials::default()).unwrap().connect().await.unwrap();
     let work = do_exercise(channel.clone(), &trainee_id, kind, seed).await.unwrap();
-    let request = pb::FinishExerciseRequest { session_id: trainee_id };
+    let request = pb::FinishExerciseRequest { session_id: trainee_id, phase: 0 };
     let finished = ExerciseServiceClient::new(channel).finish_exercise(request).await.unwrap();
     let delete = pb::DeleteSessionRequest { session_id: session.session_id };
     server.sessions().await.delete_session(delete).await.unwrap();

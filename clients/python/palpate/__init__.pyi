@@ -385,6 +385,7 @@ class Measures(Iterator[dict[str, Any]]):
     - `figures`: the figures of all tools together, by the name of the measure; `tools`: those of each tool, by its number.
     - `score_percent`: the score if it ended now; None for a trainee.
     - `advice`: what the trainer has told since the moment before: `number`, `text`, `place_m` of a marker.
+    - `phase`: the phase that goes on, from 1, None for an exercise of one piece; `phase_time_s`: simulated time since it began.
     - `result`: what `RemoteSession.finish_exercise` returns, once the exercise has ended; the iteration ends then.
     """
 
@@ -511,7 +512,11 @@ class RemoteSession:
         """Watches the measures of the session's exercise from now on, until it ends."""
     def finish_exercise(self) -> dict[str, Any]:
         """Ends the session's exercise, unless it has ended, and returns its result: `figures`, `tools`, `score_percent`, `criteria`, the
-        hidden `lumps`, the `answers`, `step` and `time_s`. A trainee gets step and time alone if the exercise says so (`is_told`)."""
+        hidden `lumps`, the `answers`, the `phases` with their figures, `step` and `time_s`. A trainee gets step and time alone if the exercise
+        says so (`is_told`)."""
+    def finish_phase(self, phase: int) -> Optional[dict[str, Any]]:
+        """Ends a phase of the session's exercise, from 1, unless it has ended, so that the next one begins. Returns None, or with the last
+        phase what `finish_exercise` returns."""
     def advise(self, text: str = "", *, place_m: Optional[Vector] = None) -> None:
         """Sends the trainee a hint (a text), or a marker at a place of the surface at rest, m. For trainers."""
     def untie(self, tool: int, number: int) -> None:

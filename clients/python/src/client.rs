@@ -656,13 +656,25 @@ impl RemoteSession {
     }
 
     /// Ends the session's exercise, unless it has ended, and returns its result: `figures`, `tools`, `score_percent`, `criteria`, the
-    /// hidden `lumps`, the `answers`, `step` and `time_s`. A trainee gets step and time alone if the exercise says so (`is_told`).
+    /// hidden `lumps`, the `answers`, the `phases` with their figures, `step` and `time_s`. A trainee gets step and time alone if the exercise
+    /// says so (`is_told`).
     fn finish_exercise<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let request = pb::FinishExerciseRequest { session_id };
+            let request = pb::FinishExerciseRequest { session_id, phase: 0 };
             let finished = called!(session, ExerciseServiceClient.finish_exercise(request))?;
             Ok(ToldResult::of(finished.result.unwrap_or_default()))
+        })
+    }
+
+    /// Ends a phase of the session's exercise, from 1, unless it has ended, so that the next one begins. Returns None, or with the last
+    /// phase what `finish_exercise` returns.
+    fn finish_phase<'py>(&self, py: Python<'py>, phase: u32) -> PyResult<Bound<'py, PyAny>> {
+        let (session, session_id) = self.own();
+        answer(py, self.awaited, async move {
+            let request = pb::FinishExerciseRequest { session_id, phase };
+            let finished = called!(session, ExerciseServiceClient.finish_exercise(request))?;
+            Ok(finished.result.map(ToldResult::of))
         })
     }
 

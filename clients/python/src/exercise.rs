@@ -37,10 +37,23 @@ pub(crate) struct KnownExercise {
     hides_truth: bool,
     live_measures: Vec<String>,
     tells_result: bool,
+    phases: Vec<KnownPhase>,
+}
+
+/// A phase of an exercise.
+#[derive(IntoPyObject)]
+struct KnownPhase {
+    title: String,
+    instructions: String,
+    time_limit_s: Option<f64>,
 }
 
 impl KnownExercise {
     pub(crate) fn of(exercise: pb::Exercise) -> Self {
+        let phase = |phase: pb::ExercisePhase| {
+            let pb::ExercisePhase { title, instructions, time_limit_s } = phase;
+            KnownPhase { title, instructions, time_limit_s }
+        };
         KnownExercise {
             name: exercise.name,
             title: exercise.title,
@@ -54,6 +67,7 @@ impl KnownExercise {
             hides_truth: exercise.hides_truth,
             live_measures: exercise.live_measures,
             tells_result: exercise.tells_result,
+            phases: exercise.phases.into_iter().map(phase).collect(),
         }
     }
 }
@@ -111,6 +125,7 @@ struct ToldAdvice {
 #[derive(IntoPyObject)]
 struct ToldCriterion {
     measure: String,
+    phase: Option<u32>,
     weight: f64,
     poor: f64,
     good: f64,
@@ -133,6 +148,16 @@ struct ToldAnswer {
     diameter_m: Option<f64>,
 }
 
+/// What was measured in a phase.
+#[derive(IntoPyObject)]
+struct ToldPhase {
+    begin_step: u64,
+    step: u64,
+    time_s: f64,
+    figures: Values,
+    tools: BTreeMap<u32, Values>,
+}
+
 /// The result of an exercise.
 #[derive(IntoPyObject)]
 pub(crate) struct ToldResult {
@@ -145,14 +170,15 @@ pub(crate) struct ToldResult {
     criteria: Vec<ToldCriterion>,
     lumps: Vec<ToldLump>,
     answers: Vec<ToldAnswer>,
+    phases: Vec<ToldPhase>,
 }
 
 impl ToldResult {
     pub(crate) fn of(result: pb::ExerciseResult) -> Self {
         let (figures, tools) = values(result.figures);
         let criterion = |earned: pb::EarnedCriterion| {
-            let pb::EarnedCriterion { measure, weight, poor, good, value, earned } = earned;
-            ToldCriterion { measure, weight, poor, good, value, earned }
+            let pb::EarnedCriterion { measure, weight, poor, good, value, earned, phase } = earned;
+            ToldCriterion { measure, phase: Some(phase).filter(|phase| *phase > 0), weight, poor, good, value, earned }
         };
         let lump = |lump: pb::HiddenLump| ToldLump {
             centre_m: place(lump.centre_m),
@@ -165,6 +191,10 @@ impl ToldResult {
             place_m: place(answer.place_m),
             diameter_m: answer.diameter_m,
         };
+        let phase = |phase: pb::PhaseResult| {
+            let (figures, tools) = values(phase.figures);
+            ToldPhase { begin_step: phase.begin_step, step: phase.step, time_s: phase.time_s, figures, tools }
+        };
         ToldResult {
             step: result.step,
             time_s: result.time_s,
@@ -175,6 +205,7 @@ impl ToldResult {
             criteria: result.criteria.into_iter().map(criterion).collect(),
             lumps: result.lumps.into_iter().map(lump).collect(),
             answers: result.answers.into_iter().map(answer).collect(),
+            phases: result.phases.into_iter().map(phase).collect(),
         }
     }
 }
@@ -188,6 +219,8 @@ struct ToldMoment {
     tools: BTreeMap<u32, Values>,
     score_percent: Option<f64>,
     advice: Vec<ToldAdvice>,
+    phase: Option<u32>,
+    phase_time_s: f64,
     result: Option<ToldResult>,
 }
 
@@ -206,6 +239,8 @@ impl ToldMoment {
             tools,
             score_percent: message.score_percent,
             advice: message.advice.into_iter().map(advice).collect(),
+            phase: Some(message.phase).filter(|phase| *phase > 0),
+            phase_time_s: message.phase_time_s,
             result: message.result.map(ToldResult::of),
         }
     }
@@ -217,6 +252,7 @@ impl ToldMoment {
 /// - `figures`: the figures of all tools together, by the name of the measure; `tools`: those of each tool, by its number.
 /// - `score_percent`: the score if it ended now; None for a trainee.
 /// - `advice`: what the trainer has told since the moment before: `number`, `text`, `place_m` of a marker.
+/// - `phase`: the phase that goes on, from 1, None for an exercise of one piece; `phase_time_s`: simulated time since it began.
 /// - `result`: what `RemoteSession.finish_exercise` returns, once the exercise has ended; the iteration ends then.
 #[pyclass(frozen, name = "Measures", module = "palpate")]
 pub(crate) struct LiveMeasures {

@@ -1,10 +1,11 @@
 // What a trainee sees after an exercise: the score, what earned it, all figures, and on the tissue what was hidden beside what was marked.
 
 import { vec } from "palpate";
-import { type EarnedCriterion, type ExerciseResult, type Figure } from "palpate/v1";
+import { type EarnedCriterion, type ExercisePhase, type ExerciseResult, type Figure } from "palpate/v1";
 import { figureRow, measureTitle, timeText, valueText } from "./figure-text";
 import type { Lump } from "./lumps";
 import { element, part } from "./page";
+import { excerpt } from "./text";
 
 /** Radius of an answer that has no size, m. */
 const MARK_M = 0.003;
@@ -23,10 +24,19 @@ function table(heading: readonly string[], rows: readonly (readonly string[])[])
 }
 
 /** Returns a row of the table of criteria: the value, and what it earned of the weight. */
-function criterionRow({ measure, weight, value, earned }: EarnedCriterion, figures: readonly Figure[]): string[] {
+function criterionRow({ measure, phase, weight, value, earned }: EarnedCriterion, figures: readonly Figure[]): string[] {
   const unit = figures.find((figure) => figure.measure === measure)?.unit ?? "";
   const text = value === undefined ? "none" : valueText(measure, value, unit);
-  return [measureTitle(measure), text, `${(earned * weight).toFixed(1)} of ${weight.toFixed(1)}`];
+  const title = measureTitle(measure) + (phase > 0 ? `, phase ${phase}` : "");
+  return [title, text, `${(earned * weight).toFixed(1)} of ${weight.toFixed(1)}`];
+}
+
+/** Returns a part that opens to a table of figures of all tools together. */
+function figureTable(summary: string, figures: readonly Figure[]): HTMLDetailsElement {
+  const made = element("details");
+  const rows = figures.filter(({ tool }) => tool === undefined).map(figureRow);
+  made.append(element("summary", { textContent: summary }), table(["Measure", "Value"], rows));
+  return made;
 }
 
 /** Returns what was hidden. */
@@ -63,7 +73,7 @@ export class Debriefing {
   }
 
   /** Shows a result. */
-  show(title: string, result: ExerciseResult): void {
+  show(title: string, result: ExerciseResult, phases: readonly ExercisePhase[]): void {
     part("debriefing-title", HTMLElement).textContent = title;
     const { isTold, scorePercent, criteria, figures, lumps, answers, timeS } = result;
     const score = scorePercent === undefined ? "" : `${Math.round(scorePercent)} %`;
@@ -72,13 +82,12 @@ export class Debriefing {
     const found = lumps.length > 0 ? ` ${lumps.length} ${lumps.length === 1 ? "lump was" : "lumps were"} hidden, ${answers.length} marked.` : "";
     part("debriefing-said", HTMLElement).textContent = told + found;
     part("debriefing-legend", HTMLElement).hidden = lumps.length + answers.length === 0;
-    const all = figures.filter(({ tool }) => tool === undefined).map(figureRow);
-    const tables = [];
-    if (criteria.length > 0) tables.push(table(["Criterion", "Value", "Points"], criteria.map((each) => criterionRow(each, figures))));
-    if (all.length > 0) {
-      const more = element("details");
-      more.append(element("summary", { textContent: "All figures" }), table(["Measure", "Value"], all));
-      tables.push(more);
+    const tables: HTMLElement[] = [];
+    const every = [...figures, ...result.phases.flatMap((phase) => phase.figures)];
+    if (criteria.length > 0) tables.push(table(["Criterion", "Value", "Points"], criteria.map((each) => criterionRow(each, every))));
+    if (figures.length > 0) tables.push(figureTable("All figures", figures));
+    for (const [index, phase] of result.phases.entries()) {
+      tables.push(figureTable(`${excerpt(phases[index]?.title ?? `Phase ${index + 1}`)}, ${timeText(phase.timeS)}`, phase.figures));
     }
     part("debriefing-tables", HTMLElement).replaceChildren(...tables);
     if (!this.dialog.open) this.dialog.showModal();

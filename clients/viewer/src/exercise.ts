@@ -46,6 +46,8 @@ export class ExercisePanel {
   /** The number of the newest advice that was shown. */
   private advised = 0;
   private result: ExerciseResult | undefined;
+  /** The phase that goes on, from 1; 0 for an exercise of one piece. */
+  private phase = 0;
 
   constructor(
     private readonly stage: Stage,
@@ -55,7 +57,8 @@ export class ExercisePanel {
     this.debriefing = new Debriefing(() => host.again());
     part("begin-exercise", HTMLButtonElement).addEventListener("click", () => void this.begin());
     this.mark.addEventListener("click", () => this.take(this.mark, (place) => void this.answer(place), "Press where you feel it."));
-    part("finish-exercise", HTMLButtonElement).addEventListener("click", () => void this.finish());
+    part("finish-exercise", HTMLButtonElement).addEventListener("click", () => void this.finish(0));
+    part("next-phase", HTMLButtonElement).addEventListener("click", () => void this.finish(this.phase));
     part("show-result", HTMLButtonElement).addEventListener("click", () => this.tellResult());
     part("trainee-link", HTMLButtonElement).addEventListener("click", () => this.exercise && this.host.share(this.exercise.traineeId));
     this.pointOut.addEventListener("click", () => this.take(this.pointOut, (place) => void this.advise(place), "Press where the trainee is to look."));
@@ -82,6 +85,7 @@ export class ExercisePanel {
       isBriefing: this.briefing.open,
       isDebriefing: this.debriefing.isOpen,
       answers: this.answers.length,
+      phase: this.phase,
       advised: this.advised,
       finished: this.result !== undefined,
       scorePercent: this.result?.scorePercent,
@@ -93,7 +97,7 @@ export class ExercisePanel {
     if (of === this.of) return;
     this.ended.abort();
     [this.ended, this.of, this.result] = [new AbortController(), of, undefined];
-    [this.answers, this.markers, this.advised] = [[], [], 0];
+    [this.answers, this.markers, this.advised, this.phase] = [[], [], 0, 0];
     this.drop();
     this.debriefing.close();
     this.briefing.close();
@@ -114,6 +118,7 @@ export class ExercisePanel {
     part("exercise-score-part", HTMLElement).hidden = this.isTrainee;
     this.tellSize();
     this.tellTime(0);
+    this.tellPhase(exercise.exercise.phases.length > 0 ? 1 : 0, 0);
     this.heard();
     void this.follow(of, this.ended.signal);
   }
@@ -126,6 +131,10 @@ export class ExercisePanel {
     if (waits && this.isTrainee && !this.briefing.open) this.briefing.showModal();
     if (!waits && this.briefing.open) this.briefing.close();
     const isOver = exercise.finished || this.result !== undefined;
+    const next = exercise.exercise?.phases[this.phase];
+    part("next-phase", HTMLButtonElement).hidden = isOver || waits || !next;
+    part("next-phase", HTMLButtonElement).textContent = next ? `Next: ${excerpt(next.title)}` : "";
+    part("finish-exercise", HTMLButtonElement).classList.toggle("main", !next);
     part("finish-exercise", HTMLButtonElement).hidden = isOver || waits;
     part("show-result", HTMLButtonElement).hidden = this.result === undefined;
     this.mark.disabled = isOver;
@@ -134,6 +143,9 @@ export class ExercisePanel {
   private limits({ exercise }: SessionExercise): HTMLElement[] {
     const rows: [string, string][] = [];
     if (exercise?.timeLimitS !== undefined) rows.push(["Time", timeText(exercise.timeLimitS)]);
+    for (const { title, timeLimitS } of exercise?.phases ?? []) {
+      rows.push([excerpt(title), timeLimitS === undefined ? "until you go on" : `at most ${timeText(timeLimitS)}`]);
+    }
     if (exercise?.forceLimitN !== undefined) rows.push(["Force", `at most ${quantity(exercise.forceLimitN, "N")}`]);
     if (exercise?.pressureLimitPa !== undefined) rows.push(["Pressure", `at most ${quantity(exercise.pressureLimitPa, "Pa")}`]);
     if (exercise?.strainLimit !== undefined) rows.push(["Strain", `at most ${Number((100 * exercise.strainLimit).toPrecision(3))} %`]);
@@ -171,8 +183,10 @@ export class ExercisePanel {
     }
   }
 
-  private tell({ timeS, figures, scorePercent, advice, result }: WatchExerciseResponse): void {
+  private tell({ timeS, figures, scorePercent, advice, result, phase, phaseTimeS }: WatchExerciseResponse): void {
     this.tellTime(timeS);
+    // The last message has the result, and the first one may come before any figure.
+    if (phase > 0) this.tellPhase(phase, phaseTimeS);
     const rows = figures.filter(({ tool }) => tool === undefined).map(figureRow);
     part("exercise-figures", HTMLElement).replaceChildren(...listed(rows));
     part("exercise-score", HTMLElement).textContent = scorePercent === undefined ? "none" : `${Math.round(scorePercent)} %`;
@@ -184,6 +198,25 @@ export class ExercisePanel {
   private tellTime(timeS: number): void {
     const limitS = this.exercise?.exercise?.timeLimitS;
     part("exercise-time", HTMLElement).textContent = timeText(timeS) + (limitS === undefined ? "" : ` of ${timeText(limitS)}`);
+  }
+
+  /** Shows the phase that goes on, with its instructions and the time that is left. */
+  private tellPhase(number: number, timeS: number): void {
+    const phases = this.exercise?.exercise?.phases ?? [];
+    const phase = phases[number - 1];
+    part("phase-part", HTMLElement).hidden = !phase;
+    const isNew = number > this.phase && this.phase > 0;
+    this.phase = number;
+    if (!phase) return;
+    const { title, instructions, timeLimitS } = phase;
+    const heading = `${number} of ${phases.length}: ${excerpt(title)}`;
+    // A screen reader says it again whenever it is written.
+    if (part("phase-title", HTMLElement).textContent !== heading) part("phase-title", HTMLElement).textContent = heading;
+    part("phase-instructions", HTMLElement).textContent = excerpt(instructions);
+    const left = timeLimitS === undefined ? "" : `${timeText(Math.ceil(Math.max(0, timeLimitS - timeS)))} left`;
+    part("phase-time", HTMLElement).textContent = left;
+    this.heard();
+    if (isNew && this.isTrainee) this.host.notice(`${heading}. ${excerpt(instructions)}`, 8);
   }
 
   private tellAdvice(all: readonly Advice[], fresh: readonly Advice[]): void {
@@ -253,16 +286,19 @@ export class ExercisePanel {
     }
   }
 
-  private async finish(): Promise<void> {
+  /** Ends a phase (from 1), or the whole exercise (0). */
+  private async finish(phase: number): Promise<void> {
     const { of } = this;
     if (!of) return;
     this.drop();
     try {
       await of.hands.letGo();
-      const { result } = await exercises.finishExercise({ sessionId: of.session.sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
-      if (result && this.of === of) this.over(result);
+      const { result } = await exercises.finishExercise({ sessionId: of.session.sessionId, phase }, { timeoutMs: CALL_TIMEOUT_MS });
+      if (this.of !== of) return;
+      if (result) this.over(result);
+      else this.tellPhase(phase + 1, 0);
     } catch (error) {
-      this.host.notice(`The exercise did not end: ${describe(error)}.`);
+      this.host.notice(`${phase > 0 ? "The phase" : "The exercise"} did not end: ${describe(error)}.`);
     }
   }
 
@@ -277,7 +313,7 @@ export class ExercisePanel {
 
   private tellResult(): void {
     const { exercise } = this.exercise ?? {};
-    if (this.result) this.debriefing.show(excerpt(exercise?.title || exercise?.name || ""), this.result);
+    if (this.result) this.debriefing.show(excerpt(exercise?.title || exercise?.name || ""), this.result, exercise?.phases ?? []);
   }
 
   /** Draws answers and markers on the tissue, and what was hidden once that is told. */

@@ -107,7 +107,8 @@ class Row {
   private tell({ exercise, state, heldTools }: Session, told?: WatchExerciseResponse): void {
     const limitS = exercise?.exercise?.timeLimitS;
     const timeS = told?.result?.timeS ?? told?.timeS ?? 0;
-    const time = timeText(timeS) + (limitS === undefined ? "" : ` of ${timeText(limitS)}`);
+    const phase = exercise?.exercise?.phases[(told?.phase ?? 0) - 1];
+    const time = timeText(timeS) + (limitS === undefined ? "" : ` of ${timeText(limitS)}`) + (phase ? `, ${excerpt(phase.title)}` : "");
     const waits = state === SessionState.PAUSED ? "Has not begun" : heldTools.length > 0 ? `Touches, ${time}` : time;
     this.state.textContent = told?.result ? `Finished after ${timeText(timeS)}` : waits;
     const percent = told?.result?.scorePercent ?? told?.scorePercent;

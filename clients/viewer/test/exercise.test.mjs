@@ -65,6 +65,30 @@ describe("an exercise", () => {
     await close(page);
   });
 
+  test("has phases, each with its instructions and its time, and goes on when the trainee does", async () => {
+    const page = await open(`${server.url}/?exercise=search-mark`);
+    await page.until(({ exercise }) => exercise.isBriefing && exercise.isTrainee && exercise.phase === 1);
+    await page.says("briefing-limits", /Search\s*at most 1:30\s*Mark\s*at most 0:45/);
+    await page.page.click("#begin-exercise");
+    await page.until(({ exercise }) => !exercise.isBriefing);
+    await page.says("phase-title", /^1 of 2: Search$/);
+    await page.says("phase-instructions", /Press the whole surface/);
+    await page.says("phase-time", /(1:[012]\d|0:\d\d) left/);
+    await page.picture("exercise-phase");
+    assert.equal(await page.text("next-phase"), "Next: Mark");
+    await page.page.click("#next-phase");
+    await page.until(({ exercise }) => exercise.phase === 2);
+    await page.says("phase-title", /^2 of 2: Mark$/);
+    assert.equal(await page.page.locator("#next-phase").isVisible(), false);
+    assert.deepEqual(await cut(page), []);
+    await page.page.click("#finish-exercise");
+    await page.until(({ exercise }) => exercise.isDebriefing && exercise.finished);
+    await page.says("debriefing-tables", /Coverage, phase 1/);
+    await page.says("debriefing-tables", /Search, [01]:\d\d/);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
   test("is followed, and helped, by a trainer who sees what is hidden", async () => {
     const trainer = await (await context()).newPage();
     await trainer.goto(`${server.url}/trainer.html`);

@@ -86,6 +86,12 @@ impl Measures {
         }
     }
 
+    /// Returns measures with the same thresholds and surface that begin at step `begin_step`. These must have taken no row.
+    #[must_use]
+    pub fn beginning_at(&self, begin_step: u64) -> Self {
+        Measures { begin_step, timeline: Timeline::new(self.rate_hz, begin_step), ..self.clone() }
+    }
+
     /// Takes the rows of the tools at the beginning, before the first step.
     pub fn begin(&mut self, rows: &[ToolRow]) {
         for row in rows {

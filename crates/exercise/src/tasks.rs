@@ -74,6 +74,12 @@ impl TaskMeasures {
         TaskMeasures { seen_along, avoided, lift, ..TaskMeasures::default() }
     }
 
+    /// Returns the same tasks, of which nothing is done yet.
+    #[must_use]
+    pub fn again(&self) -> Self {
+        TaskMeasures::new(self.seen_along, self.avoided.clone(), self.lift)
+    }
+
     /// Takes `steps` steps at whose ends the tools did what is in `rows`, and the place to lift was displaced by `lifted_m`, m.
     pub fn step(&mut self, rows: &[ToolRow], lifted_m: f64, steps: u64) {
         let is_inside = |row: &&ToolRow| {

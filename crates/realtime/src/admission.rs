@@ -10,7 +10,7 @@ use super::audited::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
 use super::event_log::{About, EventLog};
-use super::exercise_task::{ExerciseTask, MEASURES_BYTES};
+use super::exercise_task::{ExerciseTask, measures_bytes};
 use super::law_cache::LawCache;
 use super::live_exercise::{LiveExercise, SessionExercise};
 use super::pacer::Pacer;
@@ -260,7 +260,9 @@ impl Pacer {
         let points_key = first.scene.body.kind().points_key();
         let skin = memory::attempt(points_key, || Ok(Skin::of(&first)))?;
         first.shape().prepare_contact();
-        let of_exercise = exercise.as_ref().map_or(0, |exercise| exercise.plain.session_bytes() + MEASURES_BYTES);
+        let of_exercise = exercise
+            .as_ref()
+            .map_or(0, |exercise| exercise.plain.session_bytes() + measures_bytes(&exercise.chosen.exercise));
         let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes()) + of_exercise;
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, points_key)?;
         // Allocated before the lock is taken, which every call needs.
@@ -314,7 +316,7 @@ impl Pacer {
             let message = "this session plays a recording; to touch the tissue, begin a session at one of its moments (CreateSession)";
             drop(intake.close(Refusal::new(Reason::NotAvailable, "session_id", message)));
         }
-        let ended = exercise.as_ref().and_then(|exercise| exercise.ended.as_ref()).map(|ended| ended.figures.clone());
+        let ended = exercise.as_ref().and_then(|exercise| exercise.ended.clone()).map(Arc::new);
         let exercise = exercise.map(|exercise| Arc::new(LiveExercise::new(exercise, step)));
         let measured = exercise.as_ref().filter(|_| ended.is_none());
         let measuring = measured.map(|live| ExerciseTask::new(live, &session).map(Box::new)).transpose()?;
@@ -371,7 +373,7 @@ impl Pacer {
         running.frozen = frozen;
         running.exercise = measuring;
         // The next run of the journal needs it as well.
-        ended.into_iter().for_each(|figures| running.note_input(Input::ExerciseEnded(figures)));
+        ended.into_iter().for_each(|ended| running.note_input(Input::ExerciseEnded(ended)));
         running.publish_status();
         if stop.load(Ordering::Relaxed) {
             return Err(scheme_selection::given_up());

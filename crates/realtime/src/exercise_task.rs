@@ -8,19 +8,25 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::inbox::{Inbox, Request};
-use super::live_exercise::{EndedExercise, LiveExercise};
+use super::live_exercise::LiveExercise;
 use super::reading::{Piece, Reading};
 use palpate_refusal::Result;
 use palpate_session::Session;
 use palpate_session::budget::Account;
 use palpate_session::exercise_judge::thresholds;
-use palpate_session::measured_run::{MeasuredMoment, MeasuredRun};
+use palpate_session::measured_run::{EndedExercise, MeasuredMoment, MeasuredRun};
+use palpate_tissue::scene::exercise::Exercise;
 
 /// How often figures are told, per second of simulated time.
 const TOLD_HZ: f64 = 10.0;
 
-/// Memory of the measures of a session and of a copy of them, bytes.
-pub(super) const MEASURES_BYTES: u64 = 8 << 20;
+/// Memory of the measures of a whole exercise, or of a phase, and of a copy of them, bytes.
+const MEASURES_BYTES: u64 = 8 << 20;
+
+/// Returns the memory of the measures of an exercise, bytes.
+pub(super) fn measures_bytes(exercise: &Exercise) -> u64 {
+    MEASURES_BYTES * (1 + exercise.phases.len() as u64)
+}
 
 /// The measuring of a session's exercise, on its stepping thread.
 pub(super) struct ExerciseTask {
@@ -32,6 +38,8 @@ pub(super) struct ExerciseTask {
     every: u64,
     /// The step of the newest figures that were asked for.
     asked_step: u64,
+    /// Whether figures are due though no time has passed: a phase has ended.
+    is_overdue: bool,
     /// Whether the result is computed or known.
     is_over: Arc<AtomicBool>,
 }
@@ -63,12 +71,31 @@ impl ExerciseTask {
         run.see(session);
         let every = (model.scene.stepping.rate_hz / TOLD_HZ).round().max(1.0) as u64;
         let [is_computing, is_over] = [Arc::default(), Arc::default()];
-        Ok(ExerciseTask { live: live.clone(), is_computing, run, every, asked_step: begin_step, is_over })
+        Ok(ExerciseTask {
+            live: live.clone(),
+            is_computing,
+            run,
+            every,
+            asked_step: begin_step,
+            is_overdue: false,
+            is_over,
+        })
     }
 
     /// Takes the session after a step.
     pub(super) fn see(&mut self, session: &Session) {
+        let before = self.run.phase();
         self.run.see(session);
+        self.tell_phase(before);
+    }
+
+    /// Tells the phase that goes on, if it is another than before.
+    fn tell_phase(&self, before: Option<u32>) {
+        self.run
+            .phase()
+            .filter(|phase| before != Some(*phase))
+            .into_iter()
+            .for_each(|phase| self.live.tell_phase(phase));
     }
 
     /// Returns the step that a session at rest must do next, because figures are due after it; `u64::MAX` if there is none.
@@ -89,11 +116,11 @@ impl ExerciseTask {
             return self.end(session, to, account, reading);
         }
         let step = session.step_count();
-        let is_due = step.is_multiple_of(self.every) && step > self.asked_step;
+        let is_due = self.is_overdue || (step.is_multiple_of(self.every) && step > self.asked_step);
         if !is_due || self.is_computing.swap(true, Ordering::AcqRel) {
             return;
         }
-        self.asked_step = step;
+        (self.asked_step, self.is_overdue) = (step, false);
         let computed = ClearsFlag(Some(self.is_computing.clone()));
         let (live, moment) = (self.live.clone(), self.run.moment(session));
         let work = move || {
@@ -102,6 +129,30 @@ impl ExerciseTask {
             live.tell_figures(figures);
         };
         reading.post(account, Piece::Work(Box::new(work)));
+    }
+
+    /// Ends a phase of the exercise at the session's present step, if it is `phase`, from 1: with the last one the exercise ends. Returns whether
+    /// the next one has begun.
+    pub(super) fn end_phase(
+        &mut self,
+        session: &Session,
+        phase: u32,
+        to: (u64, &Arc<Inbox>),
+        account: &Account,
+        reading: &Reading,
+    ) -> bool {
+        if self.is_over.load(Ordering::Acquire) || self.run.ended().is_some() {
+            return false;
+        }
+        let goes_on = self.run.end_phase(session, phase);
+        if goes_on {
+            self.live.tell_phase(phase + 1);
+            self.is_overdue = true;
+            self.tell(session, to, account, reading);
+        } else if self.run.phase() == Some(phase) {
+            self.end(session, to, account, reading);
+        }
+        goes_on
     }
 
     /// Ends the exercise at the session's present step, unless it has ended, and has its result computed.
@@ -118,9 +169,9 @@ impl ExerciseTask {
         let computing = ClearsFlag(Some(self.is_over.clone()));
         let (moment, answers): (MeasuredMoment, _) =
             (self.run.end(session).clone(), self.run.answers(session).to_vec());
-        let inbox = inbox.clone();
+        let (inbox, begin_step) = (inbox.clone(), self.live.begin_step);
         let work = move || {
-            let ended = EndedExercise { figures: Arc::new(moment.figures()), answers };
+            let ended = EndedExercise { begin_step, figures: moment.figures(), answers };
             inbox.send(number, Request::ExerciseEnded(Arc::new(ended)));
             computing.keep();
         };

@@ -9,12 +9,12 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
-use super::live_exercise::EndedExercise;
 use super::reading::HashReply;
 use super::subscribers::{ProbeTap, SampleTap};
 use super::thread_counters::ThreadCounters;
 use palpate_refusal::{Refusal, Result};
 use palpate_session::budget::Account;
+use palpate_session::measured_run::EndedExercise;
 use palpate_session::snapshot::Saved;
 use palpate_tissue::ReadCopy;
 use palpate_tissue::lock::lock;
@@ -80,6 +80,8 @@ pub(super) enum Request {
     },
     /// Ends the session's exercise now.
     FinishExercise,
+    /// Ends this phase of the session's exercise now, from 1, unless it has ended or has not begun.
+    FinishPhase(u32),
     /// The result of the session's exercise is known.
     ExerciseEnded(Arc<EndedExercise>),
     /// Removes the session from this server: it is deleted, or has another owner.

@@ -45,7 +45,7 @@ pub mod thread_counters;
 pub use admission::{Begin, SessionReservation};
 pub use frames::FrameReader;
 pub use inbox::{Leaving, Present};
-pub use live_exercise::{EndedExercise, ExerciseNews, LiveExercise, SessionExercise, TrainerAdvice};
+pub use live_exercise::{ExerciseNews, LiveExercise, SessionExercise, TrainerAdvice};
 pub use pacer::{Pacer, fenced};
 pub use reading::{Recorded, SharedRecord};
 pub use session_handle::{Accepted, SessionHandle};

@@ -8,10 +8,9 @@ use tokio::sync::watch;
 
 use super::law_cache::{LawCache, SoughtLaw};
 use palpate_refusal::{Reason, Refusal, Result};
-use palpate_session::RecordedMark;
 use palpate_session::budget::Account;
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::measured_run::MomentFigures;
+use palpate_session::measured_run::{EndedExercise, MomentFigures};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
@@ -43,20 +42,13 @@ pub struct TrainerAdvice {
     pub place_m: Option<DVec3>,
 }
 
-/// The end of an exercise.
-#[derive(Debug, Clone, PartialEq)]
-pub struct EndedExercise {
-    /// All figures, and the score.
-    pub figures: Arc<MomentFigures>,
-    /// What was marked.
-    pub answers: Vec<RecordedMark>,
-}
-
 /// What readers of an exercise are told: always the newest.
 #[derive(Debug, Clone, Default)]
 pub struct ExerciseNews {
     /// The newest figures; `None` before the first.
     pub measured: Option<Arc<MomentFigures>>,
+    /// The phase that goes on, from 1; 0 for an exercise of one piece.
+    pub phase: u32,
     /// All advice so far, by ascending number.
     pub advice: Vec<TrainerAdvice>,
     /// The result, once the exercise has ended.
@@ -73,7 +65,7 @@ pub struct LiveExercise {
     pub trainee_id: String,
     /// The tissue without what is hidden.
     pub plain: Arc<Model>,
-    /// Number of steps done when it began.
+    /// Number of steps done when it began, also if it has ended before the session came to this server.
     pub begin_step: u64,
     plain_tissue: watch::Sender<(u64, Arc<Model>)>,
     plain_laws: LawCache,
@@ -82,8 +74,11 @@ pub struct LiveExercise {
 
 impl LiveExercise {
     pub(super) fn new(SessionExercise { chosen, trainee_id, plain, ended }: SessionExercise, begin_step: u64) -> Self {
+        // What had ended before the session came here keeps its own beginning.
+        let begin_step = ended.as_ref().map_or(begin_step, |ended| ended.begin_step);
         let ended = ended.map(Arc::new);
-        let news = watch::Sender::new(ExerciseNews { ended, ..ExerciseNews::default() });
+        let phase = u32::from(!chosen.exercise.phases.is_empty());
+        let news = watch::Sender::new(ExerciseNews { ended, phase, ..ExerciseNews::default() });
         let plain_tissue = watch::Sender::new((begin_step, plain.clone()));
         let plain_laws = LawCache::default();
         LiveExercise { chosen, trainee_id, plain, begin_step, plain_tissue, plain_laws, news }
@@ -145,9 +140,13 @@ impl LiveExercise {
         self.news.send_modify(|news| news.measured = Some(Arc::new(figures)));
     }
 
+    pub(super) fn tell_phase(&self, phase: u32) {
+        self.news.send_modify(|news| news.phase = phase);
+    }
+
     pub(super) fn tell_end(&self, ended: Arc<EndedExercise>) {
         self.news.send_modify(|news| {
-            news.measured = Some(ended.figures.clone());
+            news.measured = Some(Arc::new(ended.figures.clone()));
             news.ended = Some(ended);
         });
     }

@@ -84,7 +84,14 @@ impl PlaybackSource {
                 Some((_, Input::Tissue(model))) => fetched.change = Some(model),
                 Some((_, Input::Revive)) => fetched.is_revived = true,
                 Some((_, Input::Hold(reason))) => fetched.hold = Some(reason),
-                Some((_, Input::Start { .. } | Input::Pause | Input::DroppedSteps(_) | Input::ExerciseEnded(_)))
+                Some((
+                    _,
+                    Input::Start { .. }
+                    | Input::Pause
+                    | Input::DroppedSteps(_)
+                    | Input::ExerciseEnded(_)
+                    | Input::PhaseEnded(_),
+                ))
                 | None => {}
             }
         }

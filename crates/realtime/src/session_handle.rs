@@ -12,7 +12,7 @@ use super::event_log::{Event, EventLog};
 use super::frames::Viewer;
 use super::inbox::{Inbox, Present, Request};
 use super::law_cache::{LawCache, SoughtLaw};
-use super::live_exercise::{EndedExercise, LiveExercise};
+use super::live_exercise::{ExerciseNews, LiveExercise};
 use super::playback::Playback;
 use super::queue::{Reader, queue};
 use super::reading::{Recipient, SharedRecord};
@@ -27,6 +27,7 @@ use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::intake_transfer::Handed;
 use palpate_session::lease::LeaseId;
+use palpate_session::measured_run::EndedExercise;
 use palpate_session::rules::{Commands, Rules};
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::sample_selection::{HEARTBEAT_S, Sampler, Sampling};
@@ -419,6 +420,36 @@ impl SessionHandle {
         match (&told.ended, &told.closed) {
             (Some(ended), _) => Ok(ended.clone()),
             (None, why) => Err(why.clone().unwrap_or_else(deleted)),
+        }
+    }
+
+    /// Ends a phase of the exercise that the session is made for (from 1), unless it has ended. Returns the exercise's result if that has
+    /// ended, as it does with the last phase.
+    ///
+    /// # Errors
+    /// Refuses what [`SessionHandle::finish_exercise`] refuses, a phase that the exercise does not have ([`Reason::OutOfRange`]), and one
+    /// that has not begun ([`Reason::OutOfTurn`]).
+    pub async fn finish_phase(&self, phase: u32) -> Result<Option<Arc<EndedExercise>>> {
+        let live = self.live_exercise()?;
+        let mut news = live.news();
+        let count = live.chosen.exercise.phases.len();
+        if phase == 0 || phase as usize > count {
+            let message = format!("{phase} is no phase of the exercise, which has {count}");
+            return Err(Refusal::new(Reason::OutOfRange, "phase", message));
+        }
+        let (begun, has_ended) = (news.borrow().phase, live.has_ended());
+        if !has_ended && phase > begun {
+            let message = format!("{phase} has not begun: phase {begun} goes on");
+            return Err(Refusal::new(Reason::OutOfTurn, "phase", message));
+        }
+        self.inbox.send(self.number, Request::FinishPhase(phase));
+        let is_told = |news: &ExerciseNews| news.ended.is_some() || news.closed.is_some();
+        let told = news.wait_for(|news| is_told(news) || news.phase > phase).await;
+        let told = told.map_err(|_| deleted())?;
+        match (&told.ended, &told.closed) {
+            (Some(ended), _) => Ok(Some(ended.clone())),
+            (None, Some(why)) => Err(why.clone()),
+            (None, None) => Ok(None),
         }
     }
 

@@ -310,8 +310,17 @@ impl SessionTask {
                     exercise.end(&self.session, inbox, &self.handle.owner, context.reading);
                 }
             }
+            Request::FinishPhase(phase) => {
+                let (task, inbox) = (self.exercise.as_mut(), (self.handle.number, &self.handle.inbox));
+                let goes_on = task.is_some_and(|exercise| {
+                    exercise.end_phase(&self.session, phase, inbox, &self.handle.owner, context.reading)
+                });
+                if goes_on {
+                    self.note_input(Input::PhaseEnded(phase));
+                }
+            }
             Request::ExerciseEnded(ended) => {
-                self.note_input(Input::ExerciseEnded(ended.figures.clone()));
+                self.note_input(Input::ExerciseEnded(ended.clone()));
                 tracing::info!(session = %self.handle.id, step = ended.figures.step, "exercise ended");
                 self.handle.exercise.iter().for_each(|exercise| exercise.tell_end(ended.clone()));
             }

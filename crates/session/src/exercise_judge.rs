@@ -27,11 +27,13 @@ pub struct ExerciseJudge {
     rate_hz: f64,
     begin_step: u64,
     newest: u64,
-    /// Number of severed springs, and the numbers of threads and clips, that were there at the beginning.
+    /// The judge's own beginning: severed springs. The others are of the beginning of the exercise: the numbers of threads and clips, that were there at the beginning.
     severed_before: usize,
     /// How many of those springs are between points.
     joints_before: usize,
     ties_before: Vec<usize>,
+    /// Whether it judges a phase that is not the first: its beginning is not that of the exercise.
+    is_later_phase: bool,
     /// Whether the trainee has done anything: touched the tissue, cut it, or marked a place.
     has_acted: bool,
     /// Number of marks that were there at the beginning.
@@ -47,6 +49,17 @@ pub struct EarnedCriterion {
     pub value: Option<f64>,
     /// The part of its weight that it earned, 0 to 1.
     pub part: f64,
+}
+
+/// The figures of a phase.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PhaseFigures {
+    /// Number of steps done at its beginning and, so far, at its end.
+    pub steps: [u64; 2],
+    /// The figures that need no truth, then those of the exercise.
+    pub figures: Vec<Figure>,
+    /// Whether the trainee has done anything in it.
+    pub has_acted: bool,
 }
 
 /// The score of an exercise.
@@ -79,6 +92,7 @@ impl ExerciseJudge {
             severed_before: 0,
             joints_before: 0,
             ties_before: Vec::new(),
+            is_later_phase: false,
             has_acted: false,
             marks_before: 0,
             rate_hz: model.scene.stepping.rate_hz,
@@ -90,7 +104,7 @@ impl ExerciseJudge {
     /// before does not count. Steps that were skipped at rest count as if nothing had changed in them.
     pub fn see(&mut self, session: &Session, rows: &[ToolRow]) {
         let step = session.step_count();
-        if step == self.begin_step {
+        if step == self.begin_step && !self.is_later_phase {
             self.severed_before = session.tissue().cuts().len();
             self.joints_before = session.tissue().cuts().joint_count();
             self.marks_before = session.marks().len();
@@ -110,11 +124,40 @@ impl ExerciseJudge {
     }
 
     /// Returns the number of steps done when the time that the trainee has is up; `None` without a limit.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn limit_step(&self) -> Option<u64> {
-        // Saturating cast.
-        let steps = |limit_s: f64| ((limit_s * self.rate_hz).ceil() as u64).max(1);
-        self.exercise.time_limit_s.map(|limit_s| self.begin_step.saturating_add(steps(limit_s)))
+        self.exercise.time_limit_s.map(|limit_s| limit_step(self.begin_step, limit_s, self.rate_hz))
+    }
+
+    /// Returns the judge of the phase that begins at the session's present step, after the one that this judges. Its marks, and what is
+    /// judged step by step, are those of the phase. What is severed and tied since the exercise began counts: a wound of an earlier phase
+    /// is closed in this one.
+    pub(crate) fn of_phase(&self, session: &Session) -> Self {
+        let step = session.step_count();
+        ExerciseJudge {
+            tasks: self.tasks.again(),
+            begin_step: step,
+            newest: step,
+            is_later_phase: true,
+            severed_before: session.tissue().cuts().len(),
+            marks_before: session.marks().len(),
+            has_acted: false,
+            ..self.clone()
+        }
+    }
+
+    /// Returns the number of steps done at its beginning.
+    pub(crate) fn begin_step(&self) -> u64 {
+        self.begin_step
+    }
+
+    /// Returns the number of steps per second.
+    pub(crate) fn rate_hz(&self) -> f64 {
+        self.rate_hz
+    }
+
+    /// Returns whether the trainee has touched, cut or marked anything.
+    pub(crate) fn has_acted(&self) -> bool {
+        self.has_acted
     }
 
     /// Returns whether the time that the trainee has is up.
@@ -137,10 +180,17 @@ impl ExerciseJudge {
         &self.tasks
     }
 
-    /// Returns the score by all figures, also those that need no truth; `None` without a criterion. A trainee who has done
-    /// nothing earns nothing, though nothing was done wrong.
-    pub fn score(&self, figures: &[Figure]) -> Option<ExerciseScore> {
+    /// Returns the score by all figures, also those that need no truth, and by those of the phases so far; `None` without a criterion. A
+    /// trainee who has done nothing earns nothing, though nothing was done wrong, and so in each phase.
+    pub fn score(&self, figures: &[Figure], phases: &[PhaseFigures]) -> Option<ExerciseScore> {
         let earned = |criterion: &Criterion| {
+            let (figures, has_acted) = match criterion.phase {
+                None => (figures, self.has_acted),
+                Some(phase) => (phase as usize)
+                    .checked_sub(1)
+                    .and_then(|index| phases.get(index))
+                    .map_or((&[][..], false), |phase| (&phase.figures[..], phase.has_acted)),
+            };
             let of_all = |figure: &&Figure| figure.definition.name == criterion.measure && figure.tool.is_none();
             // A measure of single tools counts by the worst of them.
             let of_tools = figures.iter().filter(|figure| figure.definition.name == criterion.measure);
@@ -151,7 +201,7 @@ impl ExerciseJudge {
             EarnedCriterion {
                 criterion: criterion.clone(),
                 value,
-                part: value.filter(|_| self.has_acted).map_or(0.0, |value| criterion.part(value)),
+                part: value.filter(|_| has_acted).map_or(0.0, |value| criterion.part(value)),
             }
         };
         let criteria: Vec<_> = self.exercise.criteria.iter().map(earned).collect();
@@ -200,6 +250,13 @@ impl ExerciseJudge {
             stitches_m: session.tissue().ties().iter().filter(holds).map(bites_m).collect(),
         }
     }
+}
+
+/// Returns the number of steps done when a time, s, is up that begins with `begin_step`.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(crate) fn limit_step(begin_step: u64, limit_s: f64, rate_hz: f64) -> u64 {
+    // Saturating cast.
+    begin_step.saturating_add(((limit_s * rate_hz).ceil() as u64).max(1))
 }
 
 /// Returns a refusal with the name of the exercise.

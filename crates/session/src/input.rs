@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::command::Due;
-use super::measured_run::MomentFigures;
+use super::measured_run::EndedExercise;
 use super::{Session, ToolSample};
 use palpate_tissue::Model;
 
@@ -33,8 +33,10 @@ pub enum Input {
     /// The session is stopped for good ([`Session::hold`]), for a reason other than the guard's, such as a fault of
     /// the program. Contains the reason.
     Hold(String),
-    /// The exercise of the session has ended, with these figures. It changes no bits.
-    ExerciseEnded(Arc<MomentFigures>),
+    /// The exercise of the session has ended with this result. It changes no bits.
+    ExerciseEnded(Arc<EndedExercise>),
+    /// The trainee has ended this phase of the exercise, from 1, before its time. It changes no bits.
+    PhaseEnded(u32),
 }
 
 /// Pose of a tool and force on it at the end of a step. Vectors are in the tissue's frame.

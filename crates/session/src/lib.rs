@@ -31,6 +31,7 @@ pub mod led_instrument;
 pub mod local_model;
 pub mod measure_recorder;
 pub mod measured_run;
+pub mod phase_run;
 pub mod press;
 pub mod queue;
 pub mod recovery;

@@ -15,6 +15,7 @@ use palpate_tissue::{Model, ToolContact};
 /// whether the session runs, plays a script or is replayed.
 ///
 /// Tools with a tip have a row while they are led, forces while they push, and grasped points while they are held.
+#[derive(Debug, Clone)]
 pub struct MeasureRecorder {
     measures: Measures,
     /// A script whose forces and moves are played as functions of time, so that the session has no commands of them.
@@ -35,6 +36,12 @@ impl MeasureRecorder {
         let rate_hz = model.scene.stepping.rate_hz;
         let measures = Measures::new(rate_hz, begin_step, options, surface_m(model.shape(), seen_along).into_iter());
         Ok(MeasureRecorder { measures, continuous: continuous.cloned(), newest: begin_step, rows: Vec::new() })
+    }
+
+    /// Returns a recorder of the same tissue that begins at step `begin_step`. This one must have seen nothing.
+    #[must_use]
+    pub fn beginning_at(&self, begin_step: u64) -> Self {
+        MeasureRecorder { measures: self.measures.beginning_at(begin_step), newest: begin_step, ..self.clone() }
     }
 
     /// Takes the session at its present step. Steps that were skipped at rest count as if nothing had changed in them. A

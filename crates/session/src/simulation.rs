@@ -113,7 +113,11 @@ impl Simulation {
                 self.session.skip_to(step);
                 self.due.clear();
             }
-            Input::Start { .. } | Input::Pause | Input::DroppedSteps(_) | Input::ExerciseEnded(_) => {}
+            Input::Start { .. }
+            | Input::Pause
+            | Input::DroppedSteps(_)
+            | Input::ExerciseEnded(_)
+            | Input::PhaseEnded(_) => {}
         }
     }
 

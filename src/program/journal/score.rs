@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use palpate_exercise::Measures;
 use palpate_session::journal::ReplayEvent;
+use palpate_session::journal::exercise::ExerciseEvents;
 
 use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn_of_scene};
 use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
@@ -62,9 +63,9 @@ pub(super) fn measure(
     let place = source.file.display().to_string();
     let chosen = exercise.recorded(&place, reader.header())?;
     // What was done after the end of the exercise does not count.
-    let ends_at = match reader.header().exercise {
-        Some(_) => reader.exercise_result()?.map(|result| result.step),
-        None => None,
+    let events = match reader.header().exercise {
+        Some(_) => reader.exercise_events()?,
+        None => ExerciseEvents::default(),
     };
     let options = options.checked(usual_thresholds(chosen.as_ref()))?;
     // Each step is a row, also where the tissue rests.
@@ -73,7 +74,7 @@ pub(super) fn measure(
     if let Some(chosen) = &chosen {
         warn_of_scene(chosen, &model.scene.name);
     }
-    let mut recorder = ScoreRecorder::new(&model, begin, options, None, (chosen.as_ref(), ends_at))?;
+    let mut recorder = ScoreRecorder::new(&model, begin, options, None, (chosen.as_ref(), events))?;
     recorder.see(replay.session());
     let last = replay.survey().until_step;
     with_progress("step", last, quiet, |progress| {

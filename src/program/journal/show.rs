@@ -140,6 +140,7 @@ fn input(input: &pb::Input) -> String {
             let score = result.score_percent.map_or(String::new(), |percent| format!(", score {percent:.1} %"));
             format!("the exercise ended at step {}{score}", result.step)
         }
+        Some(What::PhaseEnd(end)) => format!("phase {} of the exercise was ended", end.phase),
         None => "an input of a later version".to_owned(),
     }
 }
@@ -156,6 +157,7 @@ fn name(input: &pb::Input) -> &'static str {
         Some(What::Revive(_)) => "revive",
         Some(What::Hold(_)) => "hold",
         Some(What::ExerciseResult(_)) => "exercise_result",
+        Some(What::PhaseEnd(_)) => "phase_end",
         None => "unknown",
     }
 }

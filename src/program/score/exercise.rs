@@ -7,23 +7,25 @@ use palpate_exercise::MeasureOptions;
 use palpate_proto::journal as pb;
 use palpate_refusal::Refusal;
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, thresholds};
+use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, PhaseFigures, thresholds};
 use palpate_session::journal::exercise::from_header;
+use palpate_session::measured_run::MomentFigures;
 use palpate_session::{RecordedMark, Session};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::exercise::Lump;
+use palpate_tissue::scene::exercise::{ExercisePhase, Lump};
 use palpate_tissue::scene::exercise_reader::find_exercise;
 use serde::{Deserialize, Serialize};
 
 use super::super::scene::{SceneArguments, compile_with};
 use super::super::{Failure, say};
+use super::ScoredMeasure;
 
 /// Which exercise, with which hidden truth.
 #[derive(clap::Args, Default)]
 pub(crate) struct ExerciseOptions {
     /// An exercise file, or the name of one that is in ./exercises or built in: `lumps-1`, `lumps-2`, `lumps-3`, `palpate-all`,
-    /// `cut-line`, `lift-hold`, `close-wound`. Its hidden lumps take the place of the scene's own
+    /// `search-mark`, `cut-line`, `lift-hold`, `close-wound`. Its hidden lumps take the place of the scene's own
     #[arg(long, value_name = "EXERCISE")]
     exercise: Option<PathBuf>,
     /// The seed of the exercise's hidden truth [default: that of the exercise]
@@ -128,6 +130,9 @@ pub(crate) struct ScoredLump {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ScoredCriterion {
     pub(crate) measure: String,
+    /// The phase whose figure counts, from 1; absent: that of the whole exercise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) phase: Option<u32>,
     pub(crate) weight: f64,
     pub(crate) poor: f64,
     pub(crate) good: f64,
@@ -136,6 +141,37 @@ pub(crate) struct ScoredCriterion {
     pub(crate) value: Option<f64>,
     /// The earned part of the weight, 0 to 1.
     pub(crate) earned: f64,
+}
+
+impl ScoredCriterion {
+    /// Returns the measure, with its phase if it is of one.
+    pub(crate) fn title(&self) -> String {
+        self.phase.map_or_else(|| self.measure.clone(), |phase| format!("{} ({phase})", self.measure))
+    }
+}
+
+/// What was measured in a phase of an exercise.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ScoredPhase {
+    pub(crate) title: String,
+    /// Steps done at its beginning, and in it.
+    pub(crate) begin_step: u64,
+    pub(crate) steps: u64,
+    /// All tools together, then each tool.
+    pub(crate) measures: Vec<ScoredMeasure>,
+}
+
+impl ScoredPhase {
+    /// Returns how long it took, s.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn time_s(&self, rate_hz: f64) -> f64 {
+        self.steps as f64 / rate_hz
+    }
+
+    /// Returns the figures of all tools together.
+    pub(crate) fn of_all_tools(&self) -> impl Iterator<Item = &ScoredMeasure> {
+        self.measures.iter().filter(|measure| measure.tool.is_none())
+    }
 }
 
 /// The exercise of a score: its truth, the answers, and what was earned.
@@ -147,15 +183,29 @@ pub(crate) struct ScoredExercise {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) score_percent: Option<f64>,
     pub(crate) criteria: Vec<ScoredCriterion>,
+    /// The phases that had begun; not written for an exercise of one piece.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) phases: Vec<ScoredPhase>,
     pub(crate) lumps: Vec<ScoredLump>,
     pub(crate) answers: Vec<ScoredAnswer>,
 }
 
 impl ScoredExercise {
-    /// Returns the exercise of a session at its end, with its score.
-    pub(crate) fn of(judge: &ExerciseJudge, seed: u64, session: &Session, score: Option<&ExerciseScore>) -> Self {
+    /// Returns the exercise of a session at its end, with its figures and its score.
+    pub(crate) fn of(judge: &ExerciseJudge, seed: u64, session: &Session, ended: &MomentFigures) -> Self {
+        let score = ended.score.as_ref();
+        let phase =
+            |(phase, PhaseFigures { steps: [begin_step, end_step], figures, .. }): (&ExercisePhase, &PhaseFigures)| {
+                ScoredPhase {
+                    title: phase.title.clone(),
+                    begin_step: *begin_step,
+                    steps: end_step - begin_step,
+                    measures: figures.iter().map(ScoredMeasure::of).collect(),
+                }
+            };
         let criterion = |EarnedCriterion { criterion, value, part }: &EarnedCriterion| ScoredCriterion {
             measure: criterion.measure.clone(),
+            phase: criterion.phase,
             weight: criterion.weight,
             poor: criterion.poor,
             good: criterion.good,
@@ -181,6 +231,7 @@ impl ScoredExercise {
                 .into_iter()
                 .flat_map(|ExerciseScore { criteria, .. }| criteria.iter().map(criterion))
                 .collect(),
+            phases: judge.exercise().phases.iter().zip(&ended.phases).map(phase).collect(),
             lumps: judge.lumps().iter().map(lump).collect(),
             answers: judge.answers(session).iter().map(answer).collect(),
         }

@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use palpate_session::Session;
 use palpate_session::chosen_exercise::ChosenExercise;
+use palpate_session::journal::exercise::ExerciseEvents;
 use palpate_session::measured_run::MeasuredRun;
 use palpate_tissue::Model;
 use palpate_tissue::scene::script::Script;
@@ -156,6 +157,13 @@ pub(crate) struct ScoredMeasure {
     pub(crate) tool: Option<u32>,
 }
 
+impl ScoredMeasure {
+    fn of(Figure { definition, value, tool }: &Figure) -> Self {
+        let (name, unit) = (definition.name.to_owned(), definition.unit.to_owned());
+        ScoredMeasure { name, value: *value, unit, tool: *tool }
+    }
+}
+
 /// A time above a limit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ScoredCrossing {
@@ -213,7 +221,7 @@ pub(crate) struct ScoreRecorder {
 }
 
 impl ScoreRecorder {
-    /// Begins at step `begin_step`; `continuous` is as for [`MeasuredRun::new`], and `ends_at` as for [`MeasuredRun::ending_at`].
+    /// Begins at step `begin_step`; `continuous` is as for [`MeasuredRun::new`], and `events` are those of a journal.
     ///
     /// # Errors
     /// Refuses what [`MeasuredRun::new`] refuses.
@@ -222,9 +230,11 @@ impl ScoreRecorder {
         begin_step: u64,
         options: MeasureOptions,
         continuous: Option<&Script>,
-        (chosen, ends_at): (Option<&ChosenExercise>, Option<u64>),
+        (chosen, events): (Option<&ChosenExercise>, ExerciseEvents),
     ) -> Result<Self, Refusal> {
-        let run = MeasuredRun::new(model, begin_step, options, continuous, chosen)?.ending_at(ends_at);
+        let run = MeasuredRun::new(model, begin_step, options, continuous, chosen)?;
+        let ends_at = events.result.map(|result| result.step);
+        let run = run.ending_phases_at(events.phase_ends).ending_at(ends_at);
         Ok(ScoreRecorder { run, seed: chosen.map_or(0, |chosen| chosen.seed), judged: None })
     }
 
@@ -239,8 +249,8 @@ impl ScoreRecorder {
     pub(crate) fn finish(&mut self, session: &Session) {
         if self.judged.is_none() {
             let ended = self.run.end(session);
-            let score = ended.figures().score;
-            self.judged = ended.judge().map(|judge| ScoredExercise::of(judge, self.seed, session, score.as_ref()));
+            let figures = ended.figures();
+            self.judged = ended.judge().map(|judge| ScoredExercise::of(judge, self.seed, session, &figures));
         }
     }
 
@@ -257,12 +267,6 @@ impl Score {
     /// Returns the score of what was measured at `rate_hz` steps per second, with all figures.
     #[allow(clippy::cast_precision_loss)]
     fn of(source: ScoreSource, rate_hz: f64, measures: &Measures, figures: &[Figure]) -> Self {
-        let measure = |Figure { definition, value, tool }: Figure| ScoredMeasure {
-            name: definition.name.to_owned(),
-            value,
-            unit: definition.unit.to_owned(),
-            tool,
-        };
         let crossing = |crossing: &LimitCrossing| {
             let LimitCrossing { tool, limit, steps: [from_step, to_step], peak } = *crossing;
             // A row holds for the step that it ends.
@@ -289,7 +293,7 @@ impl Score {
                 hands,
                 seen_along,
             },
-            measures: figures.iter().copied().map(measure).collect(),
+            measures: figures.iter().map(ScoredMeasure::of).collect(),
             limit_crossing_count: (limits.given().count() > 0).then(|| timeline.crossing_count()),
             limit_crossings: timeline.crossings().iter().map(crossing).collect(),
             exercise: None,
@@ -337,7 +341,7 @@ impl Score {
             tools.iter().for_each(|tool| text += &format!("{:>14}", shown(self.value(name, Some(*tool)))));
             let _ = writeln!(text, "  {unit}");
         }
-        if let Some(ScoredExercise { name, seed, score_percent, criteria, .. }) = &self.exercise {
+        if let Some(ScoredExercise { name, seed, score_percent, criteria, phases, .. }) = &self.exercise {
             let percent = score_percent.map_or("–".to_owned(), |percent| format!("{percent:.1} %"));
             let _ = writeln!(text, "exercise {}, seed {seed}: {percent}", printable(name));
             for criterion in criteria {
@@ -345,8 +349,16 @@ impl Score {
                 let _ = writeln!(
                     text,
                     "  {:<28}{value:>14}  {earned:>5.1} % of weight {}",
-                    criterion.measure, criterion.weight
+                    criterion.title(),
+                    criterion.weight
                 );
+            }
+            for (index, phase) in phases.iter().enumerate() {
+                let (title, time_s) = (printable(&phase.title), phase.time_s(self.rate_hz));
+                let _ = writeln!(text, "phase {}, {title}: {} s", index + 1, shown(Some(time_s)));
+                for ScoredMeasure { name, value, unit, .. } in phase.of_all_tools() {
+                    let _ = writeln!(text, "  {name:<28}{:>14}  {unit}", shown(Some(*value)));
+                }
             }
         }
         for crossing in &self.limit_crossings {

@@ -10,7 +10,7 @@ use palpate_exercise::{MeasureDefinition, Measures, register};
 
 use super::super::Failure;
 use super::super::markup::{escaped, mark_distance};
-use super::{Score, ScoredCrossing, shown};
+use super::{Score, ScoredCrossing, ScoredMeasure, shown};
 
 /// Size of the curves, pixels, with the room for the labels of the axes.
 const SIZE: [f64; 2] = [920.0, 260.0];
@@ -51,12 +51,21 @@ fn exercise(score: &Score) -> String {
         let _ = writeln!(
             html,
             "<tr><td><code>{}</code></td><td>{value}</td><td>{poor}</td><td>{good}</td><td>{}</td><td>{:.0} %</td></tr>",
-            escaped(&criterion.measure),
+            escaped(&criterion.title()),
             criterion.weight,
             100.0 * criterion.earned
         );
     }
     html += "</table>\n";
+    for (index, phase) in exercise.phases.iter().enumerate() {
+        let (title, time_s) = (escaped(&phase.title), shown(Some(phase.time_s(score.rate_hz))));
+        let _ = writeln!(html, "<h2>Phase {}, {title}: {time_s} s</h2>\n<table>", index + 1);
+        for ScoredMeasure { name, value, unit, .. } in phase.of_all_tools() {
+            let (value, unit) = (shown(Some(*value)), if unit == "1" { "" } else { unit });
+            let _ = writeln!(html, "<tr><td><code>{name}</code></td><td>{value}</td><td>{unit}</td></tr>");
+        }
+        html += "</table>\n";
+    }
     let place = |[x, y, z]: [f64; 3]| format!("{:.1}, {:.1}, {:.1}", 1e3 * x, 1e3 * y, 1e3 * z);
     if !exercise.lumps.is_empty() || !exercise.answers.is_empty() {
         html += "<table><tr><th>hidden or marked</th><th>place, mm</th><th>diameter, mm</th><th></th></tr>\n";

@@ -3,11 +3,11 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
 
 use super::keeper::FolderContent;
-use palpate_realtime::{Begin, EndedExercise, Pacer, SessionExercise};
+use palpate_realtime::{Begin, Pacer, SessionExercise};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::journal::file::JournalFile;
@@ -154,8 +154,7 @@ fn exercise(
 ) -> Result<SessionExercise> {
     let plain = pacer.plain_of(&chosen, &resumed.first, &NEVER)?;
     let trainee_id = resumed.header.exercise.as_ref().map(|exercise| exercise.trainee_id.clone()).unwrap_or_default();
-    let figures = ended.map(|result| Arc::new(journal::exercise::from_result(result)));
-    let ended = figures.map(|figures| EndedExercise { figures, answers: Vec::new() });
+    let ended = ended.map(|result| journal::exercise::from_result(result, &chosen));
     Ok(SessionExercise { chosen, trainee_id, plain, ended })
 }
 
@@ -167,7 +166,7 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
     }
     let until_step = survey.until_step;
     let chosen = journal::exercise::from_header(reader.place(), reader.header())?;
-    let ended = if chosen.is_some() { reader.exercise_result()? } else { None };
+    let ended = if chosen.is_some() { reader.exercise_events()?.result } else { None };
     let mut resumed = Replay::near(reader, survey, limits, until_step)?.resume()?;
     let begin = Begin {
         id: file.session_id.clone(),

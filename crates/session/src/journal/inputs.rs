@@ -81,7 +81,8 @@ pub(super) fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &
         Some(What::Tissue(tissue)) => Some(Input::Tissue(from_tissue(tissue, first, limits)?)),
         Some(What::Revive(_)) => Some(Input::Revive),
         Some(What::Hold(hold)) => Some(Input::Hold(hold.reason.clone())),
-        Some(What::Start(_) | What::Pause(_) | What::DroppedSteps(_) | What::ExerciseResult(_)) | None => None,
+        Some(What::Start(_) | What::Pause(_) | What::DroppedSteps(_) | What::ExerciseResult(_) | What::PhaseEnd(_))
+        | None => None,
     })
 }
 

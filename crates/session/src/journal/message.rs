@@ -245,7 +245,8 @@ pub(super) fn input(step: u64, input: &Input, tips: &mut Tips) -> pb::Input {
         Input::DroppedSteps(steps) => What::DroppedSteps(pb::DroppedSteps { steps: *steps }),
         Input::Revive => What::Revive(pb::Revive {}),
         Input::Hold(reason) => What::Hold(pb::Hold { reason: reason.clone() }),
-        Input::ExerciseEnded(figures) => What::ExerciseResult(exercise::result(figures)),
+        Input::ExerciseEnded(end) => What::ExerciseResult(exercise::result(end)),
+        Input::PhaseEnded(phase) => What::PhaseEnd(pb::PhaseEnd { phase: *phase }),
     };
     pb::Input { step, what: Some(what) }
 }

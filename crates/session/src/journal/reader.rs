@@ -19,14 +19,17 @@ use palpate_proto::journal as pb;
 use palpate_proto::measure::{self, memory_of, varint};
 use prost::Message;
 
+use super::exercise::ExerciseEvents;
 use super::format::{MAX_BYTES, MAX_INPUTS, Topic};
 use super::message::fill_tips;
 use super::records::{
     CHANNEL, CHUNK, CHUNK_HEAD, DATA_END, HEAD, HEADER, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX, SCHEMA, number,
 };
 use crate::budget::Taken;
+use crate::phase_run::PhaseEnd;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::memory;
+use palpate_tissue::scene::exercise::MAX_PHASES;
 
 /// A batch of a journal: the content of one chunk, whose checksum has been checked. Each function decodes its
 /// messages anew.
@@ -504,22 +507,27 @@ impl<'s> JournalReader<'s> {
         Ok(survey)
     }
 
-    /// Reads the file once from the beginning, and moves to the first batch again. Returns the result of the session's exercise; `None` if
-    /// it has not ended in this journal.
+    /// Reads the file once from the beginning, and moves to the first batch again. Returns what the journal has of the session's exercise:
+    /// where its phases were ended before their time, and its result, if it has ended.
     ///
     /// # Errors
     /// Returns the refusals of [`JournalReader::next_batch`], and refuses inputs that can't be decoded.
-    pub fn exercise_result(&mut self) -> Result<Option<pb::ExerciseResult>> {
+    pub fn exercise_events(&mut self) -> Result<ExerciseEvents> {
         self.rewind();
-        let mut found = None;
-        while let (None, Some(batch)) = (&found, self.next_batch()?) {
-            found = batch.inputs()?.into_iter().find_map(|input| match input.what {
-                Some(pb::input::What::ExerciseResult(result)) => Some(result),
-                _ => None,
-            });
+        let mut events = ExerciseEvents::default();
+        while let (None, Some(batch)) = (&events.result, self.next_batch()?) {
+            for input in batch.inputs()? {
+                match input.what {
+                    Some(pb::input::What::ExerciseResult(result)) => events.result = Some(result),
+                    Some(pb::input::What::PhaseEnd(end)) if events.phase_ends.len() < MAX_PHASES => {
+                        events.phase_ends.push(PhaseEnd { phase: end.phase, step: input.step });
+                    }
+                    _ => {}
+                }
+            }
         }
         self.rewind();
-        Ok(found)
+        Ok(events)
     }
 
     /// Returns the next batch; `None` after the last whole one, also if bytes of a torn batch follow.

@@ -4,7 +4,7 @@ use glam::DVec3;
 use palpate_geometry::dice::Dice;
 
 /// The built-in exercises: name and TOML text, by ascending name.
-pub const BUILT_IN: [(&str, &str); 7] = [
+pub const BUILT_IN: [(&str, &str); 8] = [
     ("close-wound", include_str!("../../../../exercises/close-wound.toml")),
     ("cut-line", include_str!("../../../../exercises/cut-line.toml")),
     ("lift-hold", include_str!("../../../../exercises/lift-hold.toml")),
@@ -12,10 +12,14 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("lumps-2", include_str!("../../../../exercises/lumps-2.toml")),
     ("lumps-3", include_str!("../../../../exercises/lumps-3.toml")),
     ("palpate-all", include_str!("../../../../exercises/palpate-all.toml")),
+    ("search-mark", include_str!("../../../../exercises/search-mark.toml")),
 ];
 
 /// Largest number of lumps, lines, regions to avoid and criteria of an exercise, each.
 pub const MAX_PARTS: usize = 64;
+
+/// Largest number of phases of an exercise.
+pub const MAX_PHASES: usize = 8;
 
 /// How often a lump is placed anew before the exercise is refused: its box has no room for another one.
 const MAX_DRAWS: usize = 1000;
@@ -37,6 +41,8 @@ pub struct Exercise {
     pub seed: u64,
     /// The time that the trainee has, s: what is done later does not count. `None`: as long as it takes.
     pub time_limit_s: Option<f64>,
+    /// Its phases, one after the other; none if it is one piece. It ends with the last one.
+    pub phases: Vec<ExercisePhase>,
     /// The direction along which the trainee looks at the surface, of length 1. Distances along it do not count: an answer is on the
     /// surface and the lump below it, and a cut is deeper than its line.
     pub seen_along: DVec3,
@@ -56,6 +62,17 @@ pub struct Exercise {
     pub criteria: Vec<Criterion>,
     /// What the trainee is told.
     pub trainee: TraineeView,
+}
+
+/// A part of an exercise that is measured for itself.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ExercisePhase {
+    /// What people call it.
+    pub title: String,
+    /// What the trainee is asked to do in it.
+    pub instructions: String,
+    /// The time after which the next one begins, s. `None`: when the trainee goes on.
+    pub time_limit_s: Option<f64>,
 }
 
 /// What a trainee is told of their measures.
@@ -155,6 +172,8 @@ pub struct ExerciseLimits {
 pub struct Criterion {
     /// Name of the measure.
     pub measure: String,
+    /// The phase whose figure counts, from 1; `None`: that of the whole exercise.
+    pub phase: Option<u32>,
     /// Its weight beside the other criteria, above 0.
     pub weight: f64,
     /// The value that earns nothing.

@@ -4,8 +4,8 @@ use glam::DVec3;
 
 use super::collection::{Collection, is_name, name_in};
 use super::exercise::{
-    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, HiddenLumps, LiftTask, MAX_PARTS,
-    TraineeView,
+    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, ExercisePhase, HiddenLumps, LiftTask,
+    MAX_PARTS, MAX_PHASES, TraineeView,
 };
 use super::kind::TextKind;
 use super::toml_document::{Document, Fields, Item};
@@ -59,16 +59,18 @@ fn read(fields: &mut Fields<'_>) -> Result<Exercise> {
         set: fields.item("set").map_or(Ok(Vec::new()), |item| item.list()?.iter().map(Item::text).collect())?,
         seed: fields.item("seed").map_or(Ok(1), |item| item.whole())?,
         time_limit_s: positive_or_none(fields, "time_limit_s")?,
+        phases: parts(fields, "phase", MAX_PHASES)?.iter().map(|item| item.table(phase)).collect::<Result<_>>()?,
         seen_along: seen_along(fields)?,
         lumps: fields.item("lumps").map(|item| item.table(lumps)).transpose()?,
-        lines: parts(fields, "line")?.iter().map(|item| item.table(line)).collect::<Result<_>>()?,
-        avoid: parts(fields, "avoid")?.iter().map(|item| item.table(avoided)).collect::<Result<_>>()?,
+        lines: parts(fields, "line", MAX_PARTS)?.iter().map(|item| item.table(line)).collect::<Result<_>>()?,
+        avoid: parts(fields, "avoid", MAX_PARTS)?.iter().map(|item| item.table(avoided)).collect::<Result<_>>()?,
         lift: fields.item("lift").map(|item| item.table(lift)).transpose()?,
         coverage: fields.item("coverage").map(|item| item.table(coverage)).transpose()?,
         limits: fields.item("limits").map_or(Ok(ExerciseLimits::default()), |item| item.table(limits))?,
         criteria: criteria(fields)?,
         trainee: fields.item("trainee").map_or(Ok(TraineeView::default()), |item| item.table(trainee))?,
     };
+    check_phases(&exercise)?;
     if exercise.lumps(exercise.seed).is_none() {
         let message = "have no room in the box from `from_m` to `to_m`: make it larger, or the lumps fewer, smaller or less apart";
         return Err(fields.refuse(Reason::OutOfRange, "lumps", message));
@@ -76,11 +78,11 @@ fn read(fields: &mut Fields<'_>) -> Result<Exercise> {
     Ok(exercise)
 }
 
-/// Returns the entries of `[[key]]`, at most [`MAX_PARTS`]; none if the key is absent.
-fn parts<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
+/// Returns the entries of `[[key]]`, at most `most`; none if the key is absent.
+fn parts<'a>(fields: &mut Fields<'a>, key: &'static str, most: usize) -> Result<Vec<Item<'a>>> {
     let items = fields.item(key).map_or(Ok(Vec::new()), |item| item.tables())?;
-    if items.len() > MAX_PARTS {
-        let message = format!("has {} entries, more than {MAX_PARTS}", items.len());
+    if items.len() > most {
+        let message = format!("has {} entries, more than {most}", items.len());
         return Err(fields.refuse(Reason::TooLarge, key, message));
     }
     Ok(items)
@@ -177,6 +179,29 @@ fn lumps(fields: &mut Fields<'_>) -> Result<HiddenLumps> {
     })
 }
 
+fn phase(fields: &mut Fields<'_>) -> Result<ExercisePhase> {
+    Ok(ExercisePhase {
+        title: fields.required("title")?.text()?,
+        instructions: fields.required("instructions")?.text()?.trim().to_owned(),
+        time_limit_s: positive_or_none(fields, "time_limit_s")?,
+    })
+}
+
+/// Refuses criteria of phases that the exercise has not.
+fn check_phases(exercise: &Exercise) -> Result<()> {
+    for (index, criterion) in exercise.criteria.iter().enumerate() {
+        let count = exercise.phases.len();
+        if criterion.phase.is_some_and(|phase| phase == 0 || phase as usize > count) {
+            let message = match count {
+                0 => "names a phase of an exercise that has no [[phase]]".to_owned(),
+                _ => format!("must be a phase, from 1 to {count}"),
+            };
+            return Err(Refusal::new(Reason::OutOfRange, format!("criterion[{index}].phase"), message));
+        }
+    }
+    Ok(())
+}
+
 fn line(fields: &mut Fields<'_>) -> Result<CutLine> {
     let item = fields.required("points_m")?;
     let points_m = item.list()?.iter().map(Item::vector).collect::<Result<Vec<_>>>()?;
@@ -231,11 +256,16 @@ fn criteria(fields: &mut Fields<'_>) -> Result<Vec<Criterion>> {
         }
         let path = fields.path("weight");
         let weight = positive(&path, fields.number("weight")?.unwrap_or(1.0))?;
-        Ok(Criterion { measure: fields.required("measure")?.text()?, weight, poor, good })
+        // Saturating: a number beyond all phases is refused.
+        let phase = |item: Item<'_>| item.whole().map(|phase| u32::try_from(phase).unwrap_or(u32::MAX));
+        let phase = fields.item("phase").map(phase).transpose()?;
+        Ok(Criterion { measure: fields.required("measure")?.text()?, phase, weight, poor, good })
     };
-    let criteria = parts(fields, "criterion")?.iter().map(|item| item.table(criterion)).collect::<Result<Vec<_>>>()?;
+    let criteria =
+        parts(fields, "criterion", MAX_PARTS)?.iter().map(|item| item.table(criterion)).collect::<Result<Vec<_>>>()?;
     for (index, criterion) in criteria.iter().enumerate() {
-        if criteria[..index].iter().any(|other| other.measure == criterion.measure) {
+        let is_same = |other: &Criterion| other.measure == criterion.measure && other.phase == criterion.phase;
+        if criteria[..index].iter().any(is_same) {
             let field = format!("criterion[{index}].measure");
             return Err(Refusal::new(Reason::OutOfRange, field, "occurs twice: give each measure one weight"));
         }
@@ -320,6 +350,17 @@ apart_m = 0.01
                 "[lumps]",
                 "[[criterion]]\nmeasure = \"time_s\"\npoor = 1\ngood = 1\n[lumps]",
                 "mine.toml:8: criterion[0].good: must differ",
+            ),
+            ("[lumps]", "[[phase]]\ntitle = \"One\"\n[lumps]", "mine.toml:5: phase[0].instructions: is missing"),
+            (
+                "[lumps]",
+                "[[phase]]\ntitle = \"One\"\ninstructions = \"Do.\"\n[[criterion]]\nmeasure = \"time_s\"\nphase = 2\npoor = 1\ngood = 2\n[lumps]",
+                "mine.toml:10: criterion[0].phase: must be a phase, from 1 to 1",
+            ),
+            (
+                "[lumps]",
+                "[[criterion]]\nmeasure = \"time_s\"\nphase = 1\npoor = 1\ngood = 2\n[lumps]",
+                "mine.toml:7: criterion[0].phase: names a phase of an exercise that has no",
             ),
         ] {
             assert!(LUMPS.contains(from), "{from}");
