@@ -402,9 +402,12 @@ fn check_tells_what_to_expect_and_warns_of_what_can_not_be_meant() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let liver = checked(folder, &["liver"]);
-    for part in
-        ["size          0.075 m × 0.075 m (75 mm × 75 mm), 63.7 g in all", "N/m where a disc of 5 mm radius", "rest  "]
-    {
+    for part in [
+        "size          0.075 m × 0.075 m (75 mm × 75 mm), 63.7 g in all",
+        "extent        from [0, 0, 0] to [0.075, 0.075, 0],",
+        "N/m where a disc of 5 mm radius",
+        "rest  ",
+    ] {
         assert!(liver.contains(part), "no `{part}` in: {liver}");
     }
     assert!(!liver.contains("warning"), "{liver}");

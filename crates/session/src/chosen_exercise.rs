@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::Model;
 use palpate_tissue::scene::exercise::{Exercise, Lump};
 
 /// An exercise and its hidden truth.
@@ -37,6 +38,30 @@ impl ChosenExercise {
     /// Returns the assignments by which a scene gets the hidden lumps.
     pub fn assignments(&self) -> Vec<String> {
         self.exercise.assignments(&self.lumps)
+    }
+
+    /// Returns what is doubtful about the hidden lumps in a tissue: each that it can hardly show, as a sentence.
+    pub fn warnings(&self, model: &Model) -> Vec<String> {
+        let edge_m = model.shape().edge_m();
+        let doubt = |(index, lump): (usize, &Lump)| {
+            let width_m = 2.0 * lump.radius_m;
+            let why = match () {
+                () if width_m < edge_m => {
+                    format!("is {:.1} mm wide, less than the {:.1} mm between two points", 1e3 * width_m, 1e3 * edge_m)
+                }
+                () if lump.stiffness_factor == 1.0 => {
+                    "has a stiffness_factor of 1, that of the tissue around it".to_owned()
+                }
+                () => return None,
+            };
+            Some(format!(
+                "exercise {}: lump {} of seed {} {why}: nobody can feel it",
+                self.exercise.name,
+                index + 1,
+                self.seed
+            ))
+        };
+        self.lumps.iter().enumerate().filter_map(doubt).collect()
     }
 
     /// Refuses an exercise or a seed that another one contradicts, which is that of the journal `place`.

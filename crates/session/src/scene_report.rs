@@ -14,7 +14,7 @@ use palpate_tissue::scene::BodyKind;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::scheme::Relaxation;
-use palpate_tissue::shape::{Deepest, RestShape};
+use palpate_tissue::shape::{Deepest, Extent, RestShape};
 
 /// Bounds of plausible values. Beyond them a unit is probably wrong.
 const LONGEST_SIDE_M: f64 = 10.0;
@@ -32,7 +32,7 @@ const MAX_SHOWN: usize = 8;
 /// Expected behaviour of a tissue, and of a script on it.
 #[derive(Debug)]
 pub(super) struct Prospect {
-    size_m: DVec3,
+    extent: Extent,
     mass_kg: f64,
     radius_m: f64,
     /// The law under a fingertip in the middle; `None` if it takes too much work.
@@ -130,7 +130,7 @@ impl Prospect {
         let reach_m = law.as_ref().map_or(f64::INFINITY, Law::reach_m);
         let mass_kg = model.scene.mass_kg();
         let mut prospect = Prospect {
-            size_m,
+            extent: shape.extent(),
             mass_kg,
             radius_m,
             law,
@@ -328,6 +328,13 @@ fn rounded(value: f64) -> String {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
+/// Formats a corner of the tissue's box, m, to tenths of a millimetre, as an exercise has places.
+fn corner(place_m: DVec3) -> String {
+    // One zero: + 0.0 removes the sign of −0.
+    let [x, y, z] = place_m.to_array().map(|value_m| (1e4 * value_m).round() / 1e4 + 0.0);
+    format!("[{x}, {y}, {z}]")
+}
+
 /// Formats a length, in mm if it is less than 0.1 m.
 fn length(length_m: f64) -> String {
     if length_m < 0.1 { format!("{} mm", rounded(1e3 * length_m)) } else { format!("{} m", rounded(length_m)) }
@@ -356,8 +363,9 @@ impl fmt::Display for Meeting {
 
 impl fmt::Display for Prospect {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let sides_m = self.size_m.to_array();
-        let sides_m = if self.size_m.z > 0.0 { &sides_m[..] } else { &sides_m[..2] };
+        let size_m = self.extent.size_m();
+        let sides_m = size_m.to_array();
+        let sides_m = if size_m.z > 0.0 { &sides_m[..] } else { &sides_m[..2] };
         let sides = |factor: f64, unit: &str| {
             let sides: Vec<String> =
                 sides_m.iter().map(|side_m| format!("{} {unit}", rounded(factor * side_m))).collect();
@@ -369,10 +377,12 @@ impl fmt::Display for Prospect {
             format!("{} kg", rounded(self.mass_kg))
         };
         write!(f, "size          {}", sides(1.0, "m"))?;
-        if shorter_m(self.size_m) < 0.1 {
+        if shorter_m(size_m) < 0.1 {
             write!(f, " ({})", sides(1e3, "mm"))?;
         }
         writeln!(f, ", {mass} in all")?;
+        let [least, most] = [self.extent.least_m, self.extent.most_m].map(corner);
+        writeln!(f, "extent        from {least} to {most}, x, y and z in m")?;
         let radius = length(self.radius_m);
         match (self.stiffness_n_per_m(), &self.law) {
             (Some(stiffness), Some(law)) => {

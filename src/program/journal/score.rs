@@ -7,7 +7,7 @@ use palpate_exercise::Measures;
 use palpate_session::journal::ReplayEvent;
 use palpate_session::journal::exercise::ExerciseEvents;
 
-use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn_of_scene};
+use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn};
 use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
@@ -72,7 +72,7 @@ pub(super) fn measure(
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
     if let Some(chosen) = &chosen {
-        warn_of_scene(chosen, &model.scene.name);
+        warn(chosen, &model);
     }
     let mut recorder = ScoreRecorder::new(&model, begin, options, None, (chosen.as_ref(), events))?;
     recorder.see(replay.session());

@@ -96,12 +96,16 @@ pub(crate) fn compile(
         other => other,
     };
     let compiled = compile_with(scene, &chosen.assignments()).map_err(of_exercise)?;
-    warn_of_scene(chosen, &compiled.0.scene.name);
+    warn(chosen, &compiled.0);
     Ok(compiled)
 }
 
-/// Warns if the exercise is made for other scenes than this one.
-pub(crate) fn warn_of_scene(chosen: &ChosenExercise, scene: &str) {
+/// Warns if the exercise is made for other scenes than that of the tissue, and if this can hardly show the hidden lumps.
+pub(crate) fn warn(chosen: &ChosenExercise, model: &Model) {
+    for warning in chosen.warnings(model) {
+        say!("palpate: warning: {warning}");
+    }
+    let scene = &model.scene.name;
     if !chosen.exercise.scenes.iter().any(|name| name == scene) {
         let (name, made_for) = (&chosen.exercise.name, chosen.exercise.scenes.join(", "));
         say!("palpate: warning: exercise {name}: made for {made_for}; on `{scene}` its places may be wrong");
@@ -179,6 +183,9 @@ impl ScoredPhase {
 pub(crate) struct ScoredExercise {
     pub(crate) name: String,
     pub(crate) seed: u64,
+    /// The thresholds that options have changed: the score is not comparable with others of the exercise.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) changed_thresholds: Vec<String>,
     /// The earned part of all weights, in percent; absent without a criterion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) score_percent: Option<f64>,
@@ -226,6 +233,7 @@ impl ScoredExercise {
         ScoredExercise {
             name: judge.exercise().name.clone(),
             seed,
+            changed_thresholds: Vec::new(),
             score_percent: score.map(|score| score.percent),
             criteria: score
                 .into_iter()

@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use palpate_session::Session;
 use palpate_session::chosen_exercise::ChosenExercise;
+use palpate_session::exercise_judge::{ExerciseJudge, thresholds};
 use palpate_session::journal::exercise::ExerciseEvents;
 use palpate_session::measured_run::MeasuredRun;
 use palpate_tissue::Model;
@@ -249,8 +250,13 @@ impl ScoreRecorder {
     pub(crate) fn finish(&mut self, session: &Session) {
         if self.judged.is_none() {
             let ended = self.run.end(session);
-            let figures = ended.figures();
-            self.judged = ended.judge().map(|judge| ScoredExercise::of(judge, self.seed, session, &figures));
+            let (figures, judge) = (ended.figures(), ended.judge().cloned());
+            let options = self.run.measures().options();
+            let of = |judge: &ExerciseJudge| ScoredExercise {
+                changed_thresholds: changed(options, &thresholds(judge.exercise())),
+                ..ScoredExercise::of(judge, self.seed, session, &figures)
+            };
+            self.judged = judge.as_ref().map(of);
         }
     }
 
@@ -261,6 +267,20 @@ impl ScoreRecorder {
         let score = Score::of(source, rate_hz, measures, &figures);
         (Score { exercise: self.judged, ..score }, measures.clone())
     }
+}
+
+/// Returns the names of the thresholds that are not those of the exercise, `own`.
+fn changed(options: &MeasureOptions, own: &MeasureOptions) -> Vec<String> {
+    let (given, limits) = (&options.limits, &own.limits);
+    let changes = [
+        ("force_limit_n", given.force_n != limits.force_n),
+        ("pressure_limit_pa", given.pressure_pa != limits.pressure_pa),
+        ("strain_limit", given.strain != limits.strain),
+        ("coverage_pa", options.coverage_pa != own.coverage_pa),
+        ("press_n", options.press_n != own.press_n),
+        ("hands", options.hands != own.hands),
+    ];
+    changes.into_iter().filter(|(_, is_changed)| *is_changed).map(|(name, _)| name.to_owned()).collect()
 }
 
 impl Score {
@@ -341,9 +361,16 @@ impl Score {
             tools.iter().for_each(|tool| text += &format!("{:>14}", shown(self.value(name, Some(*tool)))));
             let _ = writeln!(text, "  {unit}");
         }
-        if let Some(ScoredExercise { name, seed, score_percent, criteria, phases, .. }) = &self.exercise {
+        if let Some(ScoredExercise { name, seed, score_percent, criteria, phases, changed_thresholds, .. }) =
+            &self.exercise
+        {
             let percent = score_percent.map_or("–".to_owned(), |percent| format!("{percent:.1} %"));
             let _ = writeln!(text, "exercise {}, seed {seed}: {percent}", printable(name));
+            if !changed_thresholds.is_empty() {
+                let names = printable(changed_thresholds.join(", "));
+                let _ =
+                    writeln!(text, "  not comparable with other scores of the exercise: {names} changed by options");
+            }
             for criterion in criteria {
                 let (value, earned) = (shown(criterion.value), 100.0 * criterion.earned);
                 let _ = writeln!(

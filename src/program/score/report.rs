@@ -44,6 +44,10 @@ fn exercise(score: &Score) -> String {
     let Some(exercise) = &score.exercise else { return String::new() };
     let percent = exercise.score_percent.map_or_else(String::new, |percent| format!(": {percent:.0} %"));
     let mut html = format!("<h2>Exercise {}, seed {}{percent}</h2>\n", escaped(&exercise.name), exercise.seed);
+    if !exercise.changed_thresholds.is_empty() {
+        let names = escaped(&exercise.changed_thresholds.join(", "));
+        let _ = writeln!(html, "<p>Not comparable with other scores of the exercise: {names} changed by options.</p>");
+    }
     html +=
         "<table><tr><th>criterion</th><th>value</th><th>poor</th><th>good</th><th>weight</th><th>earned</th></tr>\n";
     for criterion in &exercise.criteria {
