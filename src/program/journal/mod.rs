@@ -13,6 +13,7 @@ mod recover;
 mod score;
 mod show;
 mod verify;
+mod xapi;
 
 use std::path::{Path, PathBuf};
 

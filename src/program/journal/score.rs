@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use palpate_exercise::Measures;
+use palpate_refusal::printable::printable_json;
 use palpate_session::journal::ReplayEvent;
 use palpate_session::journal::exercise::ExerciseEvents;
 
@@ -12,12 +13,14 @@ use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, repor
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
 use super::output::{output, utc, written};
+use super::xapi::{self, XapiOptions};
 
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
     palpate journal score session.1.mcap\n  \
     palpate journal score session.1.mcap --force-limit-n 2 --report session.html\n  \
     palpate journal score session.1.mcap --output session.json\n  \
+    palpate journal score session.1.mcap --xapi session.xapi.json --actor mailto:ada@example.org --xapi-base https://example.org/simulation\n  \
     palpate journal compare *.json\n\n\
     The figures are those of `palpate run … --score` and have the same bits: the journal is simulated again. \
     docs/exercises.md has the formula and the source of each.\n\n\
@@ -39,6 +42,8 @@ pub(super) struct ScoreArguments {
     /// Write a report to print: one page with the force over time, a map of what was pressed, and each figure
     #[arg(long, value_name = "FILE.html")]
     report: Option<PathBuf>,
+    #[command(flatten)]
+    xapi: XapiOptions,
     /// Show no progress
     #[arg(short, long)]
     quiet: bool,
@@ -48,6 +53,8 @@ pub(super) struct ScoreArguments {
 pub(super) struct MeasuredJournal {
     pub(super) score: Score,
     measures: Measures,
+    /// When its recording began, ns after the beginning of 1970.
+    began_unix_ns: u64,
     /// Where it is damaged, and the last whole step.
     pub(super) damage: Option<(String, u64)>,
 }
@@ -92,6 +99,7 @@ pub(super) fn measure(
         return Err(Failure::Failed(format!("{}: {difference}", source.file.display())));
     }
     let survey = replay.survey();
+    let began_unix_ns = survey.unix_ns[0];
     let damage = survey.damage.clone().map(|damage| (damage, survey.until_step));
     let name = source.file.file_name().map(|name| name.to_string_lossy().into_owned());
     let of = ScoreSource {
@@ -99,19 +107,23 @@ pub(super) fn measure(
         script: None,
         journal: name,
         session_id: Some(replay.header().session_id.clone()),
-        recorded: Some(utc(survey.unix_ns[0])),
+        recorded: Some(utc(began_unix_ns)),
     };
     recorder.finish(replay.session());
     let (score, measures) = recorder.into_score(of, model.scene.stepping.rate_hz);
-    Ok(MeasuredJournal { score, measures, damage })
+    Ok(MeasuredJournal { score, measures, began_unix_ns, damage })
 }
 
 /// Measures a journal, and writes the score.
 pub(super) fn score(arguments: &ScoreArguments) -> Result<(), Failure> {
-    let ScoreArguments { source, options, exercise, json, output: file, report: page, quiet } = arguments;
-    let MeasuredJournal { score, measures, damage } = measure(source, options, exercise, *quiet)?;
+    let ScoreArguments { source, options, exercise, json, output: file, report: page, xapi, quiet } = arguments;
+    let MeasuredJournal { score, measures, began_unix_ns, damage } = measure(source, options, exercise, *quiet)?;
     if let Some(page) = page {
         write_file(page, report::page(&score, &measures)?.as_bytes())?;
+    }
+    if let Some(file) = &xapi.xapi {
+        let statements = xapi::statements(&score, xapi, began_unix_ns)?;
+        write_file(file, (printable_json(format!("{statements:#}")) + "\n").as_bytes())?;
     }
     match file {
         Some(file) => score.write(file)?,
