@@ -220,7 +220,7 @@ pub struct Exercise {
     /// The force that no tool may exceed.
     #[prost(double, optional, tag = "6")]
     pub force_limit_n: ::core::option::Option<f64>,
-    /// The pressure from which on a part of the surface counts as felt.
+    /// The pressure from which on a part of the surface counts as felt. Absent in a list if it follows from a lump and the tissue.
     #[prost(double, optional, tag = "7")]
     pub coverage_pa: ::core::option::Option<f64>,
     /// Whether something is hidden.

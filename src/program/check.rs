@@ -5,10 +5,11 @@ use std::path::PathBuf;
 
 use palpate_refusal::printable::printable_lines;
 use palpate_session::check;
-use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::exercise_judge::{ExerciseJudge, thresholds};
+use palpate_session::chosen_exercise::{ChosenExercise, NoticedPress};
+use palpate_session::exercise_judge::ExerciseJudge;
 use palpate_tissue::Model;
 use palpate_tissue::scene::collection::find_script;
+use palpate_tissue::scene::exercise::CoverageTask;
 
 use super::scene::{SceneArguments, compile_with};
 use super::score::exercise::{self, ExerciseOptions};
@@ -64,7 +65,7 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
     let of = |count: usize, one: &str| format!("{count} {one}{}", if count == 1 { "" } else { "s" });
     let mut parts = vec![format!("{} with seed {seed}", of(lumps.len(), "lump"))];
     parts.extend(exercise.time_limit_s.map(|limit_s| format!("{limit_s} s")));
-    let limits = thresholds(exercise).limits;
+    let limits = chosen.thresholds().limits;
     parts.extend(limits.given().map(|(kind, limit)| {
         let (name, unit) = kind.name_and_unit();
         format!("{name} at most {limit}{unit}")
@@ -77,13 +78,26 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
         "{} of weight {weight} in all",
         of(exercise.criteria.len(), "criterion").replace("criterions", "criteria")
     ));
-    format!("exercise      {}, valid: {}\n", exercise.name, parts.join(", "))
+    let felt = match (exercise.coverage, chosen.felt) {
+        (Some(CoverageTask::Lump(lump)), Some(NoticedPress { pressure_pa, force_n, depth_m })) => format!(
+            "coverage      from {pressure_pa:.0} Pa on: a tip of {:.1} mm radius, {:.1} mm deep with {force_n:.2} N, feels a lump {:.1} mm wide, {} \
+             times as stiff, {:.1} mm below\n",
+            1e3 * lump.tip_radius_m,
+            1e3 * depth_m,
+            2e3 * lump.radius_m,
+            lump.stiffness_factor,
+            1e3 * lump.depth_m
+        ),
+        _ => String::new(),
+    };
+    format!("exercise      {}, valid: {}\n{felt}", exercise.name, parts.join(", "))
 }
 
 /// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
     let (model, limits) = exercise::compile(chosen.as_ref(), &arguments.scene)?;
+    let chosen = exercise::feeling(chosen, &model)?;
     if let Some(chosen) = &chosen {
         ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
     }

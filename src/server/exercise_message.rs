@@ -5,9 +5,9 @@ use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 use palpate_realtime::{LiveExercise, TrainerAdvice};
 use palpate_session::RecordedMark;
-use palpate_session::exercise_judge::{EarnedCriterion, PhaseFigures, thresholds};
+use palpate_session::exercise_judge::{EarnedCriterion, PhaseFigures};
 use palpate_session::measured_run::{EndedExercise, MomentFigures};
-use palpate_tissue::scene::exercise::{AvoidedRegion, CutLine, Exercise, ExercisePhase, Lump};
+use palpate_tissue::scene::exercise::{AvoidedRegion, CoverageTask, CutLine, Exercise, ExercisePhase, Lump};
 
 /// Returns what everybody may know of an exercise.
 pub(super) fn exercise(exercise: &Exercise) -> pb::Exercise {
@@ -21,17 +21,20 @@ pub(super) fn exercise(exercise: &Exercise) -> pb::Exercise {
         instructions: phase.instructions.clone(),
         time_limit_s: phase.time_limit_s,
     };
-    let options = thresholds(exercise);
     pb::Exercise {
         name: exercise.name.clone(),
         title: exercise.title.clone(),
         instructions: exercise.instructions.clone(),
         scene_names: exercise.scenes.clone(),
         time_limit_s: exercise.time_limit_s,
-        force_limit_n: options.limits.force_n,
-        pressure_limit_pa: options.limits.pressure_pa,
-        strain_limit: options.limits.strain,
-        coverage_pa: exercise.coverage.map(|coverage| coverage.pressure_pa),
+        force_limit_n: exercise.limits.force_n,
+        pressure_limit_pa: exercise.limits.pressure_pa,
+        strain_limit: exercise.limits.strain,
+        coverage_pa: match exercise.coverage {
+            Some(CoverageTask::Pressure(pressure_pa)) => Some(pressure_pa),
+            // That of a lump follows from a tissue.
+            Some(CoverageTask::Lump(_)) | None => None,
+        },
         hides_truth: exercise.hides_truth(),
         seen_along: vector(exercise.seen_along),
         lines: exercise.lines.iter().map(line).collect(),
@@ -56,8 +59,10 @@ fn is_live(exercise: &Exercise, name: &str) -> bool {
 /// Returns the exercise of a session as its trainer, or a trainee, may know it.
 pub(super) fn of_session(live: &LiveExercise, is_trainee: bool) -> pb::SessionExercise {
     let role = if is_trainee { pb::ExerciseRole::Trainee } else { pb::ExerciseRole::Trainer };
+    let known = exercise(&live.chosen.exercise);
+    let felt_pa = live.chosen.felt.map(|felt| felt.pressure_pa);
     pb::SessionExercise {
-        exercise: Some(exercise(&live.chosen.exercise)),
+        exercise: Some(pb::Exercise { coverage_pa: known.coverage_pa.or(felt_pa), ..known }),
         role: role.into(),
         trainee_id: if is_trainee { String::new() } else { live.trainee_id.clone() },
         seed: (!is_trainee).then_some(live.chosen.seed),

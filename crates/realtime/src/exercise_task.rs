@@ -13,7 +13,6 @@ use super::reading::{Piece, Reading};
 use palpate_refusal::Result;
 use palpate_session::Session;
 use palpate_session::budget::Account;
-use palpate_session::exercise_judge::thresholds;
 use palpate_session::measured_run::{EndedExercise, MeasuredMoment, MeasuredRun};
 use palpate_tissue::scene::exercise::Exercise;
 
@@ -67,7 +66,7 @@ impl ExerciseTask {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn new(live: &Arc<LiveExercise>, session: &Session) -> Result<Self> {
         let (model, begin_step, chosen) = (session.model(), session.step_count(), &live.chosen);
-        let mut run = MeasuredRun::new(model, begin_step, thresholds(&chosen.exercise), None, Some(chosen))?;
+        let mut run = MeasuredRun::new(model, begin_step, chosen.thresholds(), None, Some(chosen))?;
         run.see(session);
         let every = (model.scene.stepping.rate_hz / TOLD_HZ).round().max(1.0) as u64;
         let [is_computing, is_over] = [Arc::default(), Arc::default()];

@@ -2,9 +2,21 @@
 
 use std::sync::Arc;
 
+use palpate_exercise::{MeasureOptions, ToolLimits};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
-use palpate_tissue::scene::exercise::{Exercise, Lump};
+use palpate_tissue::scene::exercise::{CoverageTask, Exercise, Lump};
+
+/// The press from which on a lump is felt.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NoticedPress {
+    /// Mean pressure under the tip beside the lump, Pa.
+    pub pressure_pa: f64,
+    /// Force beside the lump, N.
+    pub force_n: f64,
+    /// Depth of the tip, m.
+    pub depth_m: f64,
+}
 
 /// An exercise and its hidden truth.
 #[derive(Debug, Clone)]
@@ -17,6 +29,9 @@ pub struct ChosenExercise {
     pub seed: u64,
     /// The lumps that are hidden.
     pub lumps: Vec<Lump>,
+    /// The press from which on the lump of its `[coverage]` is felt; `None` if it has none, and before
+    /// [`feeling`](crate::felt_lump::feeling).
+    pub felt: Option<NoticedPress>,
 }
 
 impl ChosenExercise {
@@ -32,7 +47,24 @@ impl ChosenExercise {
             let message = format!("{seed}: the lumps of this seed have no room in their box; take another seed");
             Refusal::new(Reason::OutOfRange, "seed", message)
         })?;
-        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps })
+        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps, felt: None })
+    }
+
+    /// Returns the thresholds of the exercise, where it gives any. That of a lump is [`ChosenExercise::felt`].
+    pub fn thresholds(&self) -> MeasureOptions {
+        let Exercise { limits, coverage, seen_along, .. } = &self.exercise;
+        let usual = MeasureOptions::default();
+        let coverage_pa = match coverage {
+            Some(CoverageTask::Pressure(pressure_pa)) => Some(*pressure_pa),
+            Some(CoverageTask::Lump(_)) => self.felt.map(|felt| felt.pressure_pa),
+            None => None,
+        };
+        MeasureOptions {
+            limits: ToolLimits { force_n: limits.force_n, pressure_pa: limits.pressure_pa, strain: limits.strain },
+            coverage_pa: coverage_pa.unwrap_or(usual.coverage_pa),
+            seen_along: Some(*seen_along),
+            ..usual
+        }
     }
 
     /// Returns the assignments by which a scene gets the hidden lumps.

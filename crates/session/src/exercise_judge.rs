@@ -8,10 +8,10 @@ use crate::{RecordedMark, Session};
 use palpate_exercise::answers::{AnswerRules, HiddenTarget, MarkedPlace, place_count};
 use palpate_exercise::incision::{SeveredPlace, TargetLine};
 use palpate_exercise::tasks::{AvoidedBall, LiftTarget, TaskMeasures};
-use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, ToolLimits, ToolRow, register};
+use palpate_exercise::{ExerciseTruth, Figure, ToolRow, register};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean};
 use palpate_tissue::scene::action_check::check_free;
-use palpate_tissue::scene::exercise::{Criterion, Exercise, ExerciseLimits, Lump};
+use palpate_tissue::scene::exercise::{Criterion, Exercise, Lump};
 use palpate_tissue::shape::{PointId, RestShape};
 use palpate_tissue::{Model, TieState};
 
@@ -326,23 +326,6 @@ fn check_places(exercise: &Exercise, shape: &dyn RestShape) -> Result<()> {
     let Some(lift) = exercise.lift else { return Ok(()) };
     shape.check_place("lift.place_m", lift.place_m)?;
     check_free("lift.place_m", shape, shape.nearest(lift.place_m))
-}
-
-/// Returns the limits of an exercise.
-fn limits(exercise: &Exercise) -> ToolLimits {
-    let ExerciseLimits { force_n, pressure_pa, strain } = exercise.limits;
-    ToolLimits { force_n, pressure_pa, strain }
-}
-
-/// Returns the thresholds of an exercise, where it gives any.
-pub fn thresholds(exercise: &Exercise) -> MeasureOptions {
-    let usual = MeasureOptions::default();
-    MeasureOptions {
-        limits: limits(exercise),
-        coverage_pa: exercise.coverage.map_or(usual.coverage_pa, |coverage| coverage.pressure_pa),
-        seen_along: Some(exercise.seen_along),
-        ..usual
-    }
 }
 
 /// Returns what is severed now beside the first `before` springs, and how far it is open.

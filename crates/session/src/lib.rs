@@ -21,6 +21,7 @@ pub mod chosen_exercise;
 pub mod command;
 pub mod current_laws;
 pub mod exercise_judge;
+pub mod felt_lump;
 pub mod indentation;
 pub mod input;
 pub mod intake;

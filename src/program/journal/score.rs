@@ -8,7 +8,7 @@ use palpate_refusal::printable::printable_json;
 use palpate_session::journal::ReplayEvent;
 use palpate_session::journal::exercise::ExerciseEvents;
 
-use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn};
+use super::super::score::exercise::{ExerciseOptions, feeling, usual_thresholds, warn};
 use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
@@ -74,10 +74,11 @@ pub(super) fn measure(
         Some(_) => reader.exercise_events()?,
         None => ExerciseEvents::default(),
     };
-    let options = options.checked(usual_thresholds(chosen.as_ref()))?;
     // Each step is a row, also where the tissue rests.
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
+    let chosen = feeling(chosen, &model)?;
+    let options = options.checked(usual_thresholds(chosen.as_ref()))?;
     if let Some(chosen) = &chosen {
         warn(chosen, &model);
     }

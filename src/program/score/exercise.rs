@@ -7,7 +7,8 @@ use palpate_exercise::MeasureOptions;
 use palpate_proto::journal as pb;
 use palpate_refusal::Refusal;
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, PhaseFigures, thresholds};
+use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseScore, PhaseFigures};
+use palpate_session::felt_lump;
 use palpate_session::journal::exercise::from_header;
 use palpate_session::measured_run::MomentFigures;
 use palpate_session::{RecordedMark, Session};
@@ -15,6 +16,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::exercise::{ExercisePhase, Lump};
 use palpate_tissue::scene::exercise_reader::find_exercise;
+use palpate_tissue::select::scheme_selection::NEVER;
 use serde::{Deserialize, Serialize};
 
 use super::super::scene::{SceneArguments, compile_with};
@@ -72,7 +74,15 @@ fn of_option(refusal: Refusal) -> Refusal {
 
 /// Returns the thresholds of an exercise; the usual ones without an exercise.
 pub(crate) fn usual_thresholds(chosen: Option<&ChosenExercise>) -> MeasureOptions {
-    chosen.map_or_else(MeasureOptions::default, |chosen| thresholds(&chosen.exercise))
+    chosen.map_or_else(MeasureOptions::default, ChosenExercise::thresholds)
+}
+
+/// Returns the exercise with the press from which on the lump of its `[coverage]` is felt in this tissue, if it has one.
+///
+/// # Errors
+/// Refuses what [`felt_lump::feeling`] refuses.
+pub(crate) fn feeling(chosen: Option<ChosenExercise>, model: &Model) -> Result<Option<ChosenExercise>, Refusal> {
+    chosen.map(|chosen| felt_lump::feeling(chosen, model, &Limits::default(), &NEVER)).transpose()
 }
 
 /// Compiles the scene that the arguments name, with the exercise's changes if there is one. Returns it with the limits in force.

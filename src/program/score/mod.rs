@@ -16,14 +16,14 @@ use serde::{Deserialize, Serialize};
 
 use palpate_session::Session;
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::exercise_judge::{ExerciseJudge, thresholds};
+use palpate_session::exercise_judge::ExerciseJudge;
 use palpate_session::journal::exercise::ExerciseEvents;
 use palpate_session::measured_run::MeasuredRun;
 use palpate_tissue::Model;
 use palpate_tissue::scene::script::Script;
 
 use super::{Failure, write_file};
-use exercise::ScoredExercise;
+use exercise::{ScoredExercise, usual_thresholds};
 
 /// Thresholds of measures, and the hands.
 #[derive(clap::Args)]
@@ -217,6 +217,8 @@ pub(crate) struct Score {
 pub(crate) struct ScoreRecorder {
     run: MeasuredRun,
     seed: u64,
+    /// The thresholds of the exercise itself.
+    own: MeasureOptions,
     /// What the end of the session has shown.
     judged: Option<ScoredExercise>,
 }
@@ -236,7 +238,8 @@ impl ScoreRecorder {
         let run = MeasuredRun::new(model, begin_step, options, continuous, chosen)?;
         let ends_at = events.result.map(|result| result.step);
         let run = run.ending_phases_at(events.phase_ends).ending_at(ends_at);
-        Ok(ScoreRecorder { run, seed: chosen.map_or(0, |chosen| chosen.seed), judged: None })
+        let own = usual_thresholds(chosen);
+        Ok(ScoreRecorder { run, seed: chosen.map_or(0, |chosen| chosen.seed), own, judged: None })
     }
 
     /// Takes the session at its present step. When the exercise ends, judges it; what comes later does not count.
@@ -253,7 +256,7 @@ impl ScoreRecorder {
             let (figures, judge) = (ended.figures(), ended.judge().cloned());
             let options = self.run.measures().options();
             let of = |judge: &ExerciseJudge| ScoredExercise {
-                changed_thresholds: changed(options, &thresholds(judge.exercise())),
+                changed_thresholds: changed(options, &self.own),
                 ..ScoredExercise::of(judge, self.seed, session, &figures)
             };
             self.judged = judge.as_ref().map(of);

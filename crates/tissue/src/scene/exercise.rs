@@ -151,9 +151,24 @@ pub struct LiftTask {
 
 /// How the surface must be pressed.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CoverageTask {
+pub enum CoverageTask {
     /// The pressure from which on a part of the surface counts as felt, Pa.
-    pub pressure_pa: f64,
+    Pressure(f64),
+    /// The pressure from which on this lump would be felt: it follows from the tissue.
+    Lump(FeltLump),
+}
+
+/// A lump that must be felt where it could be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FeltLump {
+    /// Its radius, m.
+    pub radius_m: f64,
+    /// Distance of its nearest place from the surface, m.
+    pub depth_m: f64,
+    /// Stiffness inside over that outside.
+    pub stiffness_factor: f64,
+    /// Radius of the fingertip that feels it, m.
+    pub tip_radius_m: f64,
 }
 
 /// Values that the trainee must stay below; `None`: no limit.

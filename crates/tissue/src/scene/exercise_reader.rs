@@ -4,13 +4,14 @@ use glam::DVec3;
 
 use super::collection::{Collection, is_name, name_in};
 use super::exercise::{
-    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, ExercisePhase, HiddenLumps, LiftTask,
-    MAX_PARTS, MAX_PHASES, TraineeView,
+    AvoidedRegion, CoverageTask, Criterion, CutLine, Exercise, ExerciseLimits, ExercisePhase, FeltLump, HiddenLumps,
+    LiftTask, MAX_PARTS, MAX_PHASES, TraineeView,
 };
 use super::kind::TextKind;
 use super::toml_document::{Document, Fields, Item};
 use crate::files;
 use crate::limits::Limits;
+use palpate_haptics::Tip;
 use palpate_refusal::{Reason, Refusal, Result, not_negative, number, positive};
 use std::path::Path;
 
@@ -114,7 +115,7 @@ fn scenes(fields: &mut Fields<'_>) -> Result<Vec<String>> {
 }
 
 /// Reads a range: one number, or [least, most].
-fn range(fields: &mut Fields<'_>, key: &'static str, least: f64, most: f64) -> Result<[f64; 2]> {
+fn range(fields: &mut Fields<'_>, key: &'static str, [least, most]: [f64; 2]) -> Result<[f64; 2]> {
     let item = fields.required(key)?;
     let ends = match item.number() {
         Ok(value) => [value; 2],
@@ -161,6 +162,9 @@ fn seen_along(fields: &mut Fields<'_>) -> Result<DVec3> {
 const MIN_RADIUS_M: f64 = 1e-6;
 const MAX_RADIUS_M: f64 = 1.0;
 
+/// Range of a lump's stiffness inside over that outside.
+const STIFFNESS_FACTORS: [f64; 2] = [0.01, 100.0];
+
 fn lumps(fields: &mut Fields<'_>) -> Result<HiddenLumps> {
     let from_m = fields.required("from_m")?.vector()?;
     let to_m = fields.required("to_m")?.vector()?;
@@ -170,8 +174,8 @@ fn lumps(fields: &mut Fields<'_>) -> Result<HiddenLumps> {
     }
     Ok(HiddenLumps {
         count: count(fields)?,
-        radius_m: range(fields, "radius_m", MIN_RADIUS_M, MAX_RADIUS_M)?,
-        stiffness_factor: range(fields, "stiffness_factor", 0.01, 100.0)?,
+        radius_m: range(fields, "radius_m", [MIN_RADIUS_M, MAX_RADIUS_M])?,
+        stiffness_factor: range(fields, "stiffness_factor", STIFFNESS_FACTORS)?,
         from_m,
         to_m,
         apart_m: distance(fields, "apart_m", 0.0)?,
@@ -228,7 +232,36 @@ fn lift(fields: &mut Fields<'_>) -> Result<LiftTask> {
 }
 
 fn coverage(fields: &mut Fields<'_>) -> Result<CoverageTask> {
-    Ok(CoverageTask { pressure_pa: required_positive(fields, "pressure_pa")? })
+    let lump = fields.item("lump").map(|item| item.table(felt_lump)).transpose()?;
+    match (positive_or_none(fields, "pressure_pa")?, lump) {
+        (Some(pressure_pa), None) => Ok(CoverageTask::Pressure(pressure_pa)),
+        (None, Some(lump)) => Ok(CoverageTask::Lump(lump)),
+        (None, None) => Err(fields.refuse(Reason::Missing, "pressure_pa", "is missing, or else `lump`")),
+        (Some(_), Some(_)) => Err(fields.refuse(
+            Reason::WrongKind,
+            "lump",
+            "does not go with `pressure_pa`: the pressure follows from the lump",
+        )),
+    }
+}
+
+fn felt_lump(fields: &mut Fields<'_>) -> Result<FeltLump> {
+    let default_m = Tip::default().radius_m;
+    Ok(FeltLump {
+        radius_m: within(fields, "radius_m", [MIN_RADIUS_M, MAX_RADIUS_M], None)?,
+        depth_m: distance(fields, "depth_m", 0.0)?,
+        stiffness_factor: within(fields, "stiffness_factor", STIFFNESS_FACTORS, None)?,
+        tip_radius_m: within(fields, "tip_radius_m", [MIN_RADIUS_M, MAX_RADIUS_M], Some(default_m))?,
+    })
+}
+
+/// Reads a number from `least` to `most`, required without a default.
+fn within(fields: &mut Fields<'_>, key: &'static str, [least, most]: [f64; 2], default: Option<f64>) -> Result<f64> {
+    let path = fields.path(key);
+    let given = if default.is_some() { fields.number(key)? } else { Some(fields.required_number(key)?) };
+    number(&path, given.or(default).unwrap_or(least), &format!("from {least} to {most}"), |v| {
+        (least..=most).contains(&v)
+    })
 }
 
 fn limits(fields: &mut Fields<'_>) -> Result<ExerciseLimits> {
@@ -356,6 +389,17 @@ apart_m = 0.01
                 "[lumps]",
                 "[[phase]]\ntitle = \"One\"\ninstructions = \"Do.\"\n[[criterion]]\nmeasure = \"time_s\"\nphase = 2\npoor = 1\ngood = 2\n[lumps]",
                 "mine.toml:10: criterion[0].phase: must be a phase, from 1 to 1",
+            ),
+            (
+                "[lumps]",
+                "[coverage]\npressure_pa = 1\nlump = { radius_m = 0.01, stiffness_factor = 5 }\n[lumps]",
+                "mine.toml:7: coverage.lump: does not go with `pressure_pa`",
+            ),
+            ("[lumps]", "[coverage]\n[lumps]", "mine.toml:5: coverage.pressure_pa: is missing, or else `lump`"),
+            (
+                "[lumps]",
+                "[coverage]\nlump = { radius_m = 2, stiffness_factor = 5 }\n[lumps]",
+                "mine.toml:6: coverage.lump.radius_m",
             ),
             (
                 "[lumps]",

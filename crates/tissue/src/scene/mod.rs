@@ -43,6 +43,7 @@ use action_check::physical;
 use body::KindOfBody;
 pub use body::{BodyKind, MAX_BRANCHES, MaxwellBranch, StiffnessBound};
 pub use cutting::Cutting;
+use exercise::Lump;
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 use mesh::read_bending;
@@ -322,6 +323,20 @@ impl Scene {
     /// # Errors
     /// Refuses a mesh that does not enclose its volume any more, which no scene has that was read.
     pub fn without_inclusions(&self) -> Result<Self> {
+        self.with_inclusions(Vec::new())
+    }
+
+    /// Returns the scene with a lump in place of its inclusions.
+    ///
+    /// # Errors
+    /// Refuses what [`Scene::without_inclusions`] refuses, a lump in a tissue that can have none, and one that reaches nothing of it.
+    pub fn with_lump(&self, lump: &Lump) -> Result<Self> {
+        let region = Region::Ball { centre_m: lump.centre_m, radius_m: lump.radius_m };
+        let inclusion = Inclusion { stiffness_factor: lump.stiffness_factor, ..Inclusion::even(region) };
+        self.without_inclusions()?.with_inclusions(vec![inclusion])
+    }
+
+    fn with_inclusions(&self, inclusions: Vec<Inclusion>) -> Result<Self> {
         let substance = Substance {
             body: self.body.clone(),
             material: None,
@@ -331,7 +346,7 @@ impl Scene {
             damping_n_s_per_m: self.damping_n_s_per_m,
             volume_stiffness_pa: self.volume_stiffness_pa,
         };
-        let bare = substance.with(Vec::new(), "inclusion")?;
+        let bare = substance.with(inclusions, "inclusion")?;
         let encloses = self.volume_stiffness_pa > 0.0;
         let Substance { body, .. } = if encloses { bare.enclosing(self.volume_stiffness_pa)? } else { bare };
         Ok(Scene { body, inclusions: Arc::default(), ..self.clone() })
