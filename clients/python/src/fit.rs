@@ -108,9 +108,9 @@ pub(crate) fn fit<'py>(
     given.set_item("correlations", shaped(py, found.correlations.concat(), &[count])?)?;
     given.set_item("fitted_n", PyList::new(py, fitted_n)?)?;
     given.set_item("residual_n", PyList::new(py, residual_n)?)?;
-    given.set_item("rms_n", found.rms_n)?;
-    given.set_item("relative_rms", found.relative_rms)?;
-    given.set_item("r_squared", found.r_squared)?;
+    given.set_item("rms_n", found.residual.rms_n)?;
+    given.set_item("relative_rms", found.residual.relative_rms)?;
+    given.set_item("r_squared", found.residual.r_squared)?;
     given.set_item("noise_n", found.noise_n)?;
     given.set_item("autocorrelation", found.autocorrelation)?;
     given.set_item("runs", found.runs)?;

@@ -18,7 +18,8 @@ use palpate_tissue::scene::{Named, Scene};
 
 use super::curve_file::MeasuredCurve;
 use super::options::{FitOptions, FitProgress};
-use super::runs::{Runs, residuals, rms};
+use super::residual::{Residual, differences, rms};
+use super::runs::Runs;
 use super::scale::Scale;
 use super::search::{Minimum, minimize};
 use super::uncertainty::{MeasuredSamples, Uncertainty};
@@ -77,14 +78,8 @@ pub struct Fit {
     pub correlations: Vec<Vec<f64>>,
     /// The forces of the fitted tissue at the samples of each curve, N.
     pub fitted_n: Vec<Vec<f64>>,
-    /// The root of the mean square of fitted − measured, N: of all samples, and of each curve.
-    pub rms_n: f64,
-    /// The same of each curve, N.
-    pub rms_of_curves_n: Vec<f64>,
-    /// `rms_n` divided by the largest measured force.
-    pub relative_rms: f64,
-    /// 1 − Σ(fitted − measured)²/Σ(measured − mean)²; 0 if all measured forces are equal.
-    pub r_squared: f64,
+    /// What is between these and the measured ones.
+    pub residual: Residual,
     /// Standard deviation of the noise of a sample, N, from the residuals.
     pub noise_n: f64,
     /// Correlation between a residual and the next one; 0 if it is within what chance makes of independent ones.
@@ -237,7 +232,7 @@ impl Fitter<'_> {
             let tried = std::mem::take(&mut unseen);
             for (number, more) in tried.into_iter().zip(predicted) {
                 let Some(more) = more else { continue };
-                let added = residuals(&more, &here);
+                let added = differences(&more, &here);
                 if rms(&added) > SEEN * rms(&here) {
                     adds[number] = added.iter().map(|added| added / (multiple - 1.0)).collect();
                 } else {
@@ -277,16 +272,15 @@ impl Fitter<'_> {
             ));
         };
         let finer = self.runs.finer(&self.scene_at(active, &minimum.x)?)?;
-        let runs_err = finer.map(|finer| residuals(&finer, &minimum.predicted));
+        let runs_err = finer.map(|finer| differences(&finer, &minimum.predicted));
         let runs_err: Option<Vec<f64>> = runs_err.map(|err| err.iter().map(|err| FINER * err).collect());
         let largest_n = measured.iter().fold(0.0_f64, |largest, force_n| largest.max(force_n.abs()));
-        let residuals = residuals(&minimum.predicted, &measured);
+        let residuals = differences(&minimum.predicted, &measured);
         let data = MeasuredSamples { residuals: &residuals, lengths: &lengths, least_noise: RUNS_ERR * largest_n };
         let uncertainty = Uncertainty::of(&minimum.jacobian, &data, runs_err.as_deref());
         Ok((minimum, uncertainty))
     }
 
-    #[allow(clippy::cast_precision_loss)]
     fn finish(
         self,
         original: &Scene,
@@ -295,19 +289,13 @@ impl Fitter<'_> {
         uncertainty: Uncertainty,
         untold: Vec<UntoldParameter>,
     ) -> Result<Fit, SimulationFailure> {
-        let Runs { curves, measured, count, .. } = &self.runs;
-        let all = residuals(&minimum.predicted, measured);
-        let (mut fitted_n, mut rms_of_curves_n, mut begin) = (Vec::new(), Vec::new(), 0);
+        let Runs { curves, count, .. } = &self.runs;
+        let (mut fitted_n, mut rest) = (Vec::new(), minimum.predicted.as_slice());
         for curve in *curves {
-            let range = begin..begin + curve.force_n.len();
-            fitted_n.push(minimum.predicted[range.clone()].to_vec());
-            rms_of_curves_n.push(rms(&all[range.clone()]));
-            begin = range.end;
+            let (of_curve, others) = rest.split_at(curve.force_n.len());
+            fitted_n.push(of_curve.to_vec());
+            rest = others;
         }
-        let mean_n = measured.iter().sum::<f64>() / measured.len() as f64;
-        let spread: f64 = measured.iter().map(|force_n| (force_n - mean_n).powi(2)).sum();
-        let squares: f64 = all.iter().map(|residual| residual * residual).sum();
-        let largest_n = measured.iter().fold(0.0_f64, |largest, force_n| largest.max(force_n.abs()));
         let parameter = |(index, active): (usize, &Active)| {
             let (x, half_width) = (minimum.x[index], uncertainty.half_widths[index]);
             FittedParameter {
@@ -337,11 +325,8 @@ impl Fitter<'_> {
             parameters: active.iter().enumerate().map(parameter).collect(),
             untold,
             correlations: uncertainty.correlations,
+            residual: Residual::of(curves, &fitted_n),
             fitted_n,
-            rms_n: rms(&all),
-            rms_of_curves_n,
-            relative_rms: rms(&all) / largest_n,
-            r_squared: if spread > 0.0 { 1.0 - squares / spread } else { 0.0 },
             noise_n: uncertainty.noise,
             autocorrelation: uncertainty.autocorrelation,
             runs: *count,

@@ -11,6 +11,7 @@ use palpate_tissue::scene::Scene;
 use super::curve_file::MeasuredCurve;
 use super::options::{FitOptions, FitProgress};
 use super::parallel::in_parallel;
+use super::residual::{differences, rms};
 
 /// How many times the substeps of the given scene a run may have: a stiffer or more viscous tissue is not looked at.
 const MAX_SLOWER: u32 = 32;
@@ -116,7 +117,7 @@ impl Runs<'_> {
                 }
             }
             if let Some(joined) = &joined {
-                let rms_n = rms(&residuals(joined, &self.measured));
+                let rms_n = rms(&differences(joined, &self.measured));
                 self.rms_n = Some(self.rms_n.map_or(rms_n, |before| before.min(rms_n)));
             }
             predicted.push(joined);
@@ -129,15 +130,4 @@ impl Runs<'_> {
         let why = self.no_forces.as_ref().map_or_else(String::new, |reason| format!(" ({reason})"));
         SimulationFailure::Held(format!("{what}{why}"))
     }
-}
-
-/// Returns predicted − measured of each sample.
-pub(crate) fn residuals(predicted: &[f64], measured: &[f64]) -> Vec<f64> {
-    predicted.iter().zip(measured).map(|(predicted, measured)| predicted - measured).collect()
-}
-
-/// Returns the root of the mean square.
-#[allow(clippy::cast_precision_loss)]
-pub(crate) fn rms(values: &[f64]) -> f64 {
-    (values.iter().map(|value| value * value).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }

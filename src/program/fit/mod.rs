@@ -130,9 +130,9 @@ fn scene_text(
         curves.len(),
         if curves.len() == 1 { "curve" } else { "curves" },
         env!("CARGO_PKG_VERSION"),
-        fitted.rms_n,
-        100.0 * fitted.relative_rms,
-        fitted.r_squared
+        fitted.residual.rms_n,
+        100.0 * fitted.residual.relative_rms,
+        fitted.residual.r_squared
     )];
     let source = table
         .trim_start_matches('\u{feff}')
