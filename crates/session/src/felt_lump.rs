@@ -64,7 +64,7 @@ pub fn felt_from(model: &Model, lump: &FeltLump, limits: &Limits, stop: &AtomicB
     let lumped = plain.compile_alike(&with_lump, plain.plan.substeps, limits)?;
     let press = press(radius_m, plain.shape().takes_rigid_tips());
     #[allow(clippy::cast_precision_loss)]
-    let work = press.steps(plain.scene.stepping.rate_hz) as f64 * f64::from(lumped.plan.substeps) * plain.len() as f64;
+    let work = press.steps(&plain) as f64 * f64::from(lumped.plan.substeps) * plain.len() as f64;
     if work > MAX_WORK {
         let message = format!(
             "a press takes {work:.1e} substeps of points, more than {MAX_WORK:.0e}: give `pressure_pa` instead"

@@ -8,17 +8,23 @@ use palpate_haptics::pose_playback::SPEED_M_PER_S;
 use palpate_haptics::{Tip, TipShape};
 use palpate_refusal::{Reason, Refusal, Result, finite, number, positive};
 use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Body;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::select::scheme_selection::given_up;
 use palpate_tissue::{Footprint, Model};
 
 use super::simulation::{Simulation, SimulationFailure};
 
-/// Height above the tissue from which a tip comes to the depth at which a press begins, m; the time in which it does, and the time for
-/// which it then rests in the tissue, s. It arrives with a speed of 0: a tip that began at its first place would be dropped there from
-/// 2 mm above by the playback of poses, at 0.5 m/s, and the force of its impact would hide the first milliseconds of the press.
+/// Height above the tissue from which a tip comes to the depth at which a press begins, m. It arrives with a speed of 0: a tip that began
+/// at its first place would be dropped there from 2 mm above by the playback of poses, at 0.5 m/s, and the force of its impact would hide
+/// the first milliseconds of the press.
 const CLEARANCE_M: f64 = 0.002;
-const ARRIVES_S: f64 = 0.2;
+
+/// The time in which a tip comes to its first depth, s: through air, at most at 0.15 m/s, and into the tissue.
+const ARRIVES_ABOVE_S: f64 = 0.02;
+const ARRIVES_WITHIN_S: f64 = 0.2;
+
+/// The time for which a tip then rests in the tissue, s.
 const RESTS_S: f64 = 0.3;
 
 /// Number of samples of a press.
@@ -39,7 +45,7 @@ pub struct ImposedPress {
     /// Times, s, ascending. The first may be any: the tissue rests before it.
     pub time_s: Vec<f64>,
     /// Depth at each time, m, below 0 above the tissue: of a disc of even pressure the mean over it, of a sphere that of its lowest
-    /// place. A tip has come to the first depth in 0.2 s, and has rested for 0.3 s if that is above 0.
+    /// place. A tip comes to a first depth above 0 in 0.2 s, and rests there for 0.3 s; to another one it comes through air, in 0.02 s.
     pub depth_m: Vec<f64>,
 }
 
@@ -53,7 +59,7 @@ pub(crate) fn on_surface(model: &Model, place_m: Option<DVec3>, radius_m: f64) -
 /// Returns the place of a tip that touches the surface at rest, m, on its way in at the place and against the direction that
 /// [`on_surface`] returns. A flat rigid disc touches the highest vertex beneath it: the mean of a face that it reaches beyond is
 /// lower, and there it would press from the beginning.
-fn touching_m(model: &Model, shape: TipShape, radius_m: f64, (place_m, outward): (DVec3, DVec3)) -> DVec3 {
+pub(crate) fn touching_m(model: &Model, shape: TipShape, radius_m: f64, (place_m, outward): (DVec3, DVec3)) -> DVec3 {
     let height_m = shape.height_m(radius_m);
     if shape != TipShape::RigidDisc {
         return place_m + height_m * outward;
@@ -106,10 +112,10 @@ impl ImposedPress {
         Ok(())
     }
 
-    /// Returns the number of steps at a rate (Hz).
+    /// Returns the number of steps of a press into `model`, with those before the first sample.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub fn steps(&self, rate_hz: f64) -> u64 {
-        ((self.lead_s() + self.lasts_s()) * rate_hz).ceil() as u64
+    pub fn steps(&self, model: &Model) -> u64 {
+        ((self.lead_s(model) + self.lasts_s()) * model.scene.stepping.rate_hz).ceil() as u64
     }
 
     /// Returns the time from the first sample to the last, s.
@@ -117,18 +123,25 @@ impl ImposedPress {
         self.time_s.last().zip(self.time_s.first()).map_or(0.0, |(last, first)| last - first)
     }
 
-    /// Returns the time before the first sample, s.
-    fn lead_s(&self) -> f64 {
-        let rests_s = if self.depth_m.first().is_some_and(|depth_m| *depth_m > 0.0) { RESTS_S } else { 0.0 };
-        ARRIVES_S + rests_s
+    /// Returns the time in which the tip comes to the first depth of a press into `model`, and that for which it rests there, s. A solid
+    /// that sags from its first step on has the longer time for that.
+    fn begins_s(&self, model: &Model) -> [f64; 2] {
+        let is_within = self.depth_m.first().is_some_and(|depth_m| *depth_m > 0.0);
+        let sags = matches!(&model.scene.body, Body::Solid(solid) if !solid.gravity().is_at_rest());
+        [if is_within || sags { ARRIVES_WITHIN_S } else { ARRIVES_ABOVE_S }, if is_within { RESTS_S } else { 0.0 }]
     }
 
-    /// Returns the depth at a time after the first sample, s, or before it while the tip arrives, m. `before` is the number of a
-    /// sample before that time, which goes up.
-    fn depth_at_m(&self, time_s: f64, before: &mut usize) -> f64 {
+    /// Returns the time before the first sample, s.
+    fn lead_s(&self, model: &Model) -> f64 {
+        self.begins_s(model).iter().sum()
+    }
+
+    /// Returns the depth at a time after the first sample, s, or before it while the tip arrives, m. `begins_s` are the times of
+    /// [`ImposedPress::begins_s`]; `before` is the number of a sample before that time, which goes up.
+    fn depth_at_m(&self, time_s: f64, begins_s: [f64; 2], before: &mut usize) -> f64 {
         let begins_m = self.depth_m.first().copied().unwrap_or(0.0);
         if time_s <= 0.0 {
-            let part = ((time_s + self.lead_s()) / ARRIVES_S).clamp(0.0, 1.0);
+            let part = ((time_s + begins_s[0] + begins_s[1]) / begins_s[0]).clamp(0.0, 1.0);
             let above_m = begins_m.min(0.0) - CLEARANCE_M;
             return above_m + (begins_m - above_m) * (part * part * (3.0 - 2.0 * part));
         }
@@ -157,16 +170,17 @@ impl ImposedPress {
         let at_rest = on_surface(model, self.place_m, self.radius_m);
         let (touching_m, outward) = (touching_m(model, self.shape, self.radius_m, at_rest), at_rest.1);
         let tip = Tip { shape: self.shape, radius_m: self.radius_m, friction: 0.0, ..Tip::default() };
-        let (step_s, lead_s) = (model.scene.stepping.rate_hz.recip(), self.lead_s());
+        let (step_s, begins_s) = (model.scene.stepping.rate_hz.recip(), self.begins_s(model));
+        let lead_s = begins_s[0] + begins_s[1];
         let mut simulation = Simulation::new(model, limits);
         let mut forces_n = Vec::with_capacity(self.time_s.len());
         let (mut before_n, mut before) = (0.0, 0);
-        for step in 0..self.steps(model.scene.stepping.rate_hz) {
+        for step in 0..self.steps(model) {
             if stop.load(Ordering::Relaxed) {
                 return Err(given_up().into());
             }
             let ends_s = (step + 1) as f64 * step_s - lead_s;
-            let place_m = touching_m - self.depth_at_m(ends_s, &mut before) * outward;
+            let place_m = touching_m - self.depth_at_m(ends_s, begins_s, &mut before) * outward;
             simulation.command(0, Action::Pose { place_m, velocity_m_per_s: None, tip })?;
             simulation.step(0)?;
             if let Some(reason) = simulation.session.fault() {
