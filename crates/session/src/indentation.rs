@@ -12,7 +12,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
 use palpate_tissue::scene::script::Script;
 
-use super::press::on_surface;
+use super::press::{on_surface, touching_m};
 use super::run::{RunEvent, RunOptions, run_with};
 use super::simulation::SimulationFailure;
 
@@ -37,7 +37,8 @@ pub struct Indentation {
     pub shape: TipShape,
     /// Radius of the tip, m.
     pub radius_m: f64,
-    /// Largest depth, m: of a disc of even pressure the mean over it, of a sphere that of its lowest place.
+    /// Largest depth, m: of a disc of even pressure the mean over it, of a sphere that of its lowest place, of a rigid disc that beneath
+    /// the highest place under it.
     pub depth_m: f64,
     /// Mean speed on the way in and back, m/s.
     pub speed_m_per_s: f64,
@@ -99,15 +100,13 @@ impl Indentation {
             }
     }
 
-    /// Returns the script of the indentation: its only tool is the tip.
+    /// Returns the script of an indentation from `touching_m`, the place of the tip that touches the tissue, m: its only tool is the tip.
     ///
     /// # Errors
     /// Refuses a tip that does not suit the tissue, with the fields of a script.
-    fn script(&self, model: &Model, limits: &Limits) -> Result<(Script, DVec3, DVec3)> {
-        let (place_m, outward) = on_surface(model, self.place_m, self.radius_m);
+    fn script(&self, model: &Model, touching_m: DVec3, outward: DVec3, limits: &Limits) -> Result<Script> {
         let away_m = CLEARANCE * self.radius_m;
-        let height_m = self.shape.height_m(self.radius_m);
-        let at = |out_m: f64| (place_m + (height_m + out_m) * outward).to_array();
+        let at = |out_m: f64| (touching_m + out_m * outward).to_array();
         let [down_s, rest_s, up_s] = self.times_s();
         let mut text = format!("name = \"indent\"\nduration_s = {up_s:?}\nsample_every_s = {SAMPLE_S}\n\n[[tool]]\n");
         let (shape, radius_m) = (self.shape.name(), self.radius_m);
@@ -116,7 +115,7 @@ impl Indentation {
             let _ = writeln!(text, "    {{ at_s = {at_s:?}, place_m = {:?} }},", at(out_m));
         }
         text += "]\n";
-        Ok((Script::parse("indent", &text, Path::new(""), &model.scene, limits)?, place_m, outward))
+        Script::parse("indent", &text, Path::new(""), &model.scene, limits)
     }
 
     /// Returns the times at which the tip has arrived at its depth, leaves it, and is back, s.
@@ -145,15 +144,16 @@ impl Indentation {
         clock_s: &dyn Fn() -> f64,
         progress: &mut dyn FnMut(u64),
     ) -> std::result::Result<Indented, SimulationFailure> {
-        let (script, place_m, outward) = self.script(model, limits).map_err(SimulationFailure::Refused)?;
+        let (place_m, outward) = on_surface(model, self.place_m, self.radius_m);
+        let touching_m = touching_m(model, self.shape, self.radius_m, (place_m, outward));
+        let script = self.script(model, touching_m, outward, limits)?;
         let mut samples: Vec<(f64, f64)> = Vec::new();
-        let height_m = self.shape.height_m(self.radius_m);
         let options = RunOptions::default();
         let summary = run_with(model, &script, options, limits, clock_s, &mut |event| {
             match event {
                 RunEvent::Record(record) => {
                     let sample = record.tools.first().map(|tool| {
-                        let depth_m = height_m - outward.dot(DVec3::from_array(tool.place_m) - place_m);
+                        let depth_m = outward.dot(touching_m - DVec3::from_array(tool.place_m));
                         (depth_m, outward.dot(DVec3::from_array(tool.force_on_tool_n)))
                     });
                     samples.extend(sample);
@@ -199,4 +199,32 @@ fn at_depth<'s>(samples: impl Iterator<Item = &'s (f64, f64)>, depth_m: f64) -> 
         before = Some((at_m, force_n));
     }
     before.map_or(0.0, |(_, force_n)| force_n)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// A plate that reaches beyond a face on all sides presses as one that just covers it does.
+    #[test]
+    fn a_plate_that_is_wider_than_the_specimen_meets_no_force_before_it_touches() {
+        let text = "[solid]\norgan = { name = \"phantom\", edge_m = 0.005, seed = 1 }\ncell_m = 0.02\nfixed = [{ plane_m = [0, 0, 0], \
+                    normal = [0, 0, 1], within_m = 0.001 }]\n[material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.4\n";
+        let model = Model::parse("block", text, &[]).unwrap();
+        let press = |radius_m| {
+            let indentation = Indentation {
+                place_m: None,
+                shape: TipShape::RigidDisc,
+                radius_m,
+                depth_m: 0.002,
+                speed_m_per_s: 0.005,
+            };
+            indentation.run(&model, &Limits::default(), &|| 0.0, &mut |_| {}).unwrap()
+        };
+        let (covers, wider) = (press(0.071), press(0.09));
+        let (first, last) = (wider.curve[0], wider.curve[DEPTHS]);
+        assert!(first.loading_n.abs() < 0.05 * last.loading_n, "{:?}", wider.curve);
+        assert!((last.loading_n / covers.curve[DEPTHS].loading_n - 1.0).abs() < 0.05, "{covers:?} {wider:?}");
+    }
 }
