@@ -2,6 +2,7 @@
 ("AcknowledgeFramesRequest", |bytes| <AcknowledgeFramesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("AcquireToolRequest", |bytes| <AcquireToolRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("AdviseTraineeRequest", |bytes| <AdviseTraineeRequest as ::prost::Message>::decode(bytes).is_ok()),
+("CompareCurvesRequest", |bytes| <CompareCurvesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("CreateHereRequest", |bytes| <CreateHereRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("CreateSessionRequest", |bytes| <CreateSessionRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("CutCallerRequest", |bytes| <CutCallerRequest as ::prost::Message>::decode(bytes).is_ok()),

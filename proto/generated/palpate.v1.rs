@@ -5673,6 +5673,91 @@ impl ::prost::Name for GetStateHashResponse {
         "/palpate.v1.GetStateHashResponse".into()
     }
 }
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CompareCurvesRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// Name of the table's file, for refusals, which name it with the line.
+    #[prost(string, tag = "2")]
+    pub file_name: ::prost::alloc::string::String,
+    /// The curves, a table in CSV as `palpate fit` reads it (docs/fitting.md): at most 256 curves and 20,000 samples.
+    #[prost(string, tag = "3")]
+    pub table: ::prost::alloc::string::String,
+    /// The tip of a table without the columns `tip` and `tip_radius_m`, of which shape and radius count; a disc of 5 mm if
+    /// absent.
+    #[prost(message, optional, tag = "4")]
+    pub tip: ::core::option::Option<Tip>,
+}
+impl ::prost::Name for CompareCurvesRequest {
+    const NAME: &'static str = "CompareCurvesRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.CompareCurvesRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.CompareCurvesRequest".into()
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CompareCurvesResponse {
+    /// In the order of the table.
+    #[prost(message, repeated, tag = "1")]
+    pub curves: ::prost::alloc::vec::Vec<ComparedCurve>,
+    /// The root of the mean square of computed − measured, of all samples, N.
+    #[prost(double, tag = "2")]
+    pub rms_n: f64,
+    /// `rms_n` divided by the largest measured force; 0 if all are 0.
+    #[prost(double, tag = "3")]
+    pub relative_rms: f64,
+    /// 1 − Σ(computed − measured)²/Σ(measured − mean)²; 0 if all measured forces are equal.
+    #[prost(double, tag = "4")]
+    pub r_squared: f64,
+}
+impl ::prost::Name for CompareCurvesResponse {
+    const NAME: &'static str = "CompareCurvesResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.CompareCurvesResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.CompareCurvesResponse".into()
+    }
+}
+/// A measured curve, and the forces of the tissue in the same press. The lists have equal lengths.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ComparedCurve {
+    /// Its name; empty if the table has one curve without a name.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// The tip that pressed: its shape and radius.
+    #[prost(message, optional, tag = "2")]
+    pub tip: ::core::option::Option<Tip>,
+    /// Time of each sample as measured, s.
+    #[prost(double, repeated, tag = "3")]
+    pub time_s: ::prost::alloc::vec::Vec<f64>,
+    /// Depth of the tip, m.
+    #[prost(double, repeated, tag = "4")]
+    pub depth_m: ::prost::alloc::vec::Vec<f64>,
+    /// Measured force of the tissue on the tip, outward, N.
+    #[prost(double, repeated, tag = "5")]
+    pub measured_n: ::prost::alloc::vec::Vec<f64>,
+    /// The computed one, N.
+    #[prost(double, repeated, tag = "6")]
+    pub computed_n: ::prost::alloc::vec::Vec<f64>,
+    /// The root of the mean square of computed − measured, N.
+    #[prost(double, tag = "7")]
+    pub rms_n: f64,
+}
+impl ::prost::Name for ComparedCurve {
+    const NAME: &'static str = "ComparedCurve";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.ComparedCurve".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.ComparedCurve".into()
+    }
+}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ListScriptsRequest {
     /// Lists only scripts made for the scene of this session, by the scene's name; all, if empty.
@@ -6315,6 +6400,33 @@ pub mod session_service_client {
                 .insert(GrpcMethod::new("palpate.v1.SessionService", "GetStateHash"));
             self.inner.unary(req, path, codec).await
         }
+        /// Presses into the tissue of a session as measured curves say, and returns the computed forces beside the measured
+        /// ones. It presses into a copy of the tissue at rest: the session feels nothing of it. RESOURCE_EXHAUSTED, reason
+        /// TOO_LARGE, if that takes more than `limits.press_work`.
+        pub async fn compare_curves(
+            &mut self,
+            request: impl tonic::IntoRequest<super::CompareCurvesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::CompareCurvesResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.SessionService/CompareCurves",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.SessionService", "CompareCurves"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Lists the server's scripts.
         pub async fn list_scripts(
             &mut self,
@@ -6603,6 +6715,16 @@ pub mod session_service_server {
             request: tonic::Request<super::GetStateHashRequest>,
         ) -> std::result::Result<
             tonic::Response<super::GetStateHashResponse>,
+            tonic::Status,
+        >;
+        /// Presses into the tissue of a session as measured curves say, and returns the computed forces beside the measured
+        /// ones. It presses into a copy of the tissue at rest: the session feels nothing of it. RESOURCE_EXHAUSTED, reason
+        /// TOO_LARGE, if that takes more than `limits.press_work`.
+        async fn compare_curves(
+            &self,
+            request: tonic::Request<super::CompareCurvesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::CompareCurvesResponse>,
             tonic::Status,
         >;
         /// Lists the server's scripts.
@@ -7232,6 +7354,51 @@ pub mod session_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetStateHashSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.SessionService/CompareCurves" => {
+                    #[allow(non_camel_case_types)]
+                    struct CompareCurvesSvc<T: SessionService>(pub Arc<T>);
+                    impl<
+                        T: SessionService,
+                    > tonic::server::UnaryService<super::CompareCurvesRequest>
+                    for CompareCurvesSvc<T> {
+                        type Response = super::CompareCurvesResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::CompareCurvesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SessionService>::compare_curves(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = CompareCurvesSvc(inner);
                         let codec = crate::codec::BoundedCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

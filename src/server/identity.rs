@@ -103,6 +103,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.NodeService/CreateHere", Access::Role(Role::Node)),
     ("/palpate.v1.NodeService/Mirror", Access::Role(Role::Node)),
     ("/palpate.v1.NodeService/TakeSession", Access::Role(Role::Node)),
+    ("/palpate.v1.SessionService/CompareCurves", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/CreateSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/DeleteJournal", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/DeleteSession", Access::Role(Role::Create)),

@@ -82,7 +82,11 @@ impl Meshes {
     /// # Errors
     /// Refuses a mesh that this caller is not uploading.
     pub(super) fn read(&self, id: &str, file_name: &str, account: &Account) -> Result<UploadReading> {
-        Ok(UploadReading { received: self.uploads.take(id, account)?, name: name_of(file_name), limits: self.limits() })
+        Ok(UploadReading {
+            received: self.uploads.take(id, account)?,
+            name: name_of(file_name, "the mesh"),
+            limits: self.limits(),
+        })
     }
 
     /// Returns a mesh that this caller has uploaded.
@@ -112,12 +116,12 @@ impl Meshes {
 }
 
 /// Returns the name of a file in refusals: without folders, and of a long name the last 64 characters, which contain
-/// the format.
-fn name_of(file_name: &str) -> String {
+/// the format. `nameless` is that of a file without one.
+pub(super) fn name_of(file_name: &str, nameless: &str) -> String {
     let name = file_name.rsplit(['/', '\\']).next().unwrap_or_default();
     let skipped = name.chars().count().saturating_sub(64);
     let end: String = name.chars().skip(skipped).collect();
-    if end.is_empty() { "the mesh".to_owned() } else { end }
+    if end.is_empty() { nameless.to_owned() } else { end }
 }
 
 /// A received mesh file that is being read.

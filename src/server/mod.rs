@@ -11,6 +11,7 @@ pub mod config;
 mod connection_leases;
 mod connections;
 mod cpu_account;
+mod curves;
 mod datagrams;
 mod descriptors;
 mod exercise_message;

@@ -13,6 +13,7 @@ use tracing::{info, warn};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
+use super::curves;
 use super::exercises;
 use super::job_pool::CancelFlag;
 use super::journals;
@@ -359,6 +360,23 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::LocateSessionResponse>, Status> {
         let ownership = self.0.fleet()?.locate(&request.get_ref().session_id).await?;
         Ok(Response::new(pb::LocateSessionResponse { ownership: Some(ownership) }))
+    }
+
+    async fn compare_curves(
+        &self,
+        request: Request<pb::CompareCurvesRequest>,
+    ) -> Result<Response<pb::CompareCurvesResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let request = request.into_inner();
+        let handle = self.0.session(&request.session_id).await?;
+        let model = handle.tissue().borrow().1.clone();
+        let taken = account.take(Resource::Memory(Purpose::Session), model.session_bytes(), "session_id")?;
+        let config = self.0.config.clone();
+        let compare = move |cancel: &CancelFlag| {
+            let _taken = taken;
+            curves::compare(&request, &model, &config.limits, cancel.flag())
+        };
+        Ok(Response::new(self.0.job_pool.work(&account, compare).await??))
     }
 
     async fn list_scripts(

@@ -122,6 +122,12 @@ impl Trainee<'_> {
             pb::GetStateHashRequest { session_id: session(), at_step: None },
         )
         .await;
+        let curves = pb::CompareCurvesRequest {
+            session_id: session(),
+            table: "time_s,depth_m,force_n\n0,0,0\n0.1,0.001,1\n".to_owned(),
+            ..Default::default()
+        };
+        self.unary("/palpate.v1.SessionService/CompareCurves", curves).await;
         self.unary("/palpate.v1.SessionService/GetJournal", pb::GetJournalRequest { session_id: session(), run: 0 })
             .await;
         self.unary("/palpate.v1.SessionService/ListJournals", pb::ListJournalsRequest {}).await;

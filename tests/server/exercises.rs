@@ -198,6 +198,7 @@ async fn a_trainee_gets_no_call_that_shows_the_truth_and_a_trainer_advises() {
     let refused = [
         sessions.save_snapshot(pb::SaveSnapshotRequest { session_id: id() }).await.err(),
         sessions.get_state_hash(pb::GetStateHashRequest { session_id: id(), at_step: None }).await.err(),
+        sessions.compare_curves(pb::CompareCurvesRequest { session_id: id(), ..Default::default() }).await.err(),
         sessions.get_script(pb::GetScriptRequest { session_id: id(), script_name: "press".into() }).await.err(),
         sessions.get_journal(pb::GetJournalRequest { session_id: id(), run: 0 }).await.err(),
         sessions.delete_journal(pb::DeleteJournalRequest { session_id: id() }).await.err(),

@@ -28,6 +28,7 @@ mod common {
 mod agones;
 mod audit;
 mod budget;
+mod curves;
 mod datagrams;
 mod devices;
 mod etcd;

@@ -70,6 +70,9 @@ pub struct Limits {
     /// tolerance. Offline ([`Limits::offline`]), 32 times as many. With the default, they take some tenths of a
     /// second. Default: 2^27.
     pub rehearsal_work: u64,
+    /// Points times substeps of the presses of measured curves that one call compares with a tissue. With the default,
+    /// they take some ten seconds. Default: 2^30.
+    pub press_work: u64,
     /// Streams that read one session. Default: 256.
     pub streams_per_session: usize,
     /// How many of these streams are reserved for streams that hold a tool; at most an eighth of
@@ -167,6 +170,7 @@ impl Default for Limits {
             contact_work: 1 << 17,
             periods_per_step: 1.0,
             rehearsal_work: 1 << 27,
+            press_work: 1 << 30,
             streams_per_session: 256,
             streams_for_holders: 32,
             streams: 16_384,
