@@ -4,24 +4,11 @@ import { vec } from "palpate";
 import { type EarnedCriterion, type ExercisePhase, type ExerciseResult, type Figure } from "palpate/v1";
 import { figureRow, measureTitle, timeText, valueText } from "./figure-text";
 import type { Lump } from "./lumps";
-import { element, part } from "./page";
+import { element, part, table } from "./page";
 import { excerpt } from "./text";
 
 /** Radius of an answer that has no size, m. */
 const MARK_M = 0.003;
-
-/** Returns a table with a heading and rows of cells. */
-function table(heading: readonly string[], rows: readonly (readonly string[])[]): HTMLTableElement {
-  const made = element("table");
-  const head = made.createTHead().insertRow();
-  for (const title of heading) head.append(element("th", { scope: "col", textContent: title }));
-  const body = made.createTBody();
-  for (const cells of rows) {
-    const row = body.insertRow();
-    for (const text of cells) row.insertCell().textContent = text;
-  }
-  return made;
-}
 
 /** Returns a row of the table of criteria: the value, and what it earned of the weight. */
 function criterionRow({ measure, phase, weight, value, earned }: EarnedCriterion, figures: readonly Figure[]): string[] {

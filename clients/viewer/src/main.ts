@@ -11,6 +11,7 @@ import { create as message, type MessageInitShape } from "@bufbuild/protobuf";
 import { norm, type Vec3 } from "palpate";
 import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
+import { Comparison } from "./comparison";
 import { ExercisePanel } from "./exercise";
 import type { Mode } from "./hand";
 import { HAND_NAMES, type Hands } from "./hands";
@@ -630,11 +631,15 @@ function copy(link: string, done: string): void {
   void navigator.clipboard.writeText(link).then(() => notice(done), failed);
 }
 part("play", HTMLButtonElement).addEventListener("click", () => void play());
-new FileOpener((session, scene) => {
-  leave();
-  made = { case: "scene", value: scene };
-  show(session, { isNew: true }).catch((error: unknown) => over(`${describe(error)}.`));
-});
+const comparison = new Comparison(() => shownSession?.session.sessionId);
+new FileOpener(
+  (session, scene) => {
+    leave();
+    made = { case: "scene", value: scene };
+    show(session, { isNew: true }).catch((error: unknown) => over(`${describe(error)}.`));
+  },
+  (file) => void comparison.take(file),
+);
 
 async function play(): Promise<void> {
   const button = part("play", HTMLButtonElement);
@@ -770,7 +775,7 @@ function isStill({ frames, samples, session, speed }: ShownSession): boolean {
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-Object.assign(window, { palpate: pageState(() => shownSession, stage, player, latency, sewing, exercise) });
+Object.assign(window, { palpate: pageState(() => shownSession, { stage, player, latency, sewing, exercise, comparison }) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";

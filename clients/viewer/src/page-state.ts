@@ -1,6 +1,7 @@
 // State of the page, for tests and measurements: `window.palpate`.
 
 import { norm, vec } from "palpate";
+import type { Comparison } from "./comparison";
 import type { ExercisePanel } from "./exercise";
 import type { Latency } from "./latency";
 import { pictureFrom } from "./pictures";
@@ -11,9 +12,23 @@ import { Sheet } from "./sheet";
 import type { Stage } from "./stage";
 import type { ShownSession } from "./session";
 
+/** The parts of the page that tell their state. */
+interface Parts {
+  stage: Stage;
+  player: Player;
+  latency: Latency;
+  sewing: Sewing;
+  exercise: ExercisePanel;
+  comparison: Comparison;
+}
+
 /** The page's state as numbers, for tests and measurements. */
-export function pageState(present: () => ShownSession | undefined, stage: Stage, player: Player, latency: Latency, sewing: Sewing, exercise: ExercisePanel) {
+export function pageState(present: () => ShownSession | undefined, { stage, player, latency, sewing, exercise, comparison }: Parts) {
   return {
+    /** The curves that are compared with the tissue. */
+    get comparison() {
+      return comparison.state;
+    },
     get frames() {
       const { taken, skipped, newest } = present()?.frames ?? { taken: 0, skipped: 0n };
       return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };

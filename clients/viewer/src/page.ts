@@ -14,6 +14,19 @@ export function element<K extends keyof HTMLElementTagNameMap>(kind: K, of: Part
   return Object.assign(document.createElement(kind), of);
 }
 
+/** Returns a table with a heading and rows of cells. */
+export function table(heading: readonly string[], rows: readonly (readonly string[])[]): HTMLTableElement {
+  const made = element("table");
+  const head = made.createTHead().insertRow();
+  for (const title of heading) head.append(element("th", { scope: "col", textContent: title }));
+  const body = made.createTBody();
+  for (const cells of rows) {
+    const row = body.insertRow();
+    for (const text of cells) row.insertCell().textContent = text;
+  }
+  return made;
+}
+
 export const asked = new URLSearchParams(location.search);
 
 /** An integer parameter of the address, if it is within the range. */

@@ -1,5 +1,5 @@
 // Two small plots of the last seconds: one line for each quantity, axes with ticks and values, and the present
-// values.
+// values; and what other plots of the page are drawn with.
 
 import { HISTORY_S, type Moment } from "./samples";
 
@@ -11,7 +11,7 @@ interface Line {
 }
 
 /** Returns the SI prefix for a magnitude: its factor and letters. */
-function prefixed(most: number): [number, string] {
+export function prefixed(most: number): [number, string] {
   if (most >= 1) return [1, ""];
   if (most >= 1e-3 || most < 1e-9) return [1e3, "m"];
   return [1e6, "µ"];
@@ -24,41 +24,87 @@ export function quantity(value: number, unit: string): string {
 }
 
 /** Returns the distance of ticks, 1, 2 or 5 times a power of ten, so that at most four fit in a span. */
-function tickDistance(span: number): number {
+export function tickDistance(span: number): number {
   const least = span / 4;
   const power = 10 ** Math.floor(Math.log10(least));
   return power * ([1, 2, 5].find((times) => times * power >= least) ?? 10);
 }
 
 /** Space for the axis values, pixels. */
-const LEFT = 38;
-const TOP = 19;
-const BOTTOM = 15;
+export const LEFT = 38;
+export const TOP = 19;
+export const BOTTOM = 15;
 /** Time between two ticks, s. */
 const TICK_S = 2;
 
-class Plot {
-  private readonly pen: CanvasRenderingContext2D | null;
+/** An empty canvas: its pen, in pixels of the page, its size, and the page's colours. */
+export interface Sketch {
+  pen: CanvasRenderingContext2D;
+  width: number;
+  height: number;
+  /** Returns the value of a CSS variable. */
+  colour: (variable: string) => string;
+}
 
+/** Clears a canvas, as fine as the screen; undefined if it is not shown. */
+export function sketch(canvas: HTMLCanvasElement): Sketch | undefined {
+  const pen = canvas.getContext("2d");
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  if (!pen || width === 0) return undefined;
+  const ratio = Math.min(devicePixelRatio, 2);
+  if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
+  if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  pen.font = "11px system-ui, sans-serif";
+  const style = getComputedStyle(canvas);
+  return { pen, width, height, colour: (variable) => style.getPropertyValue(variable) };
+}
+
+/** Returns a number in a unit with a prefix, as it stands at a tick. */
+export function tickText(value: number, factor: number): string {
+  return String(Number((value * factor).toPrecision(3))).replace("-", "−");
+}
+
+/** Draws the lines and the values of a vertical axis. Returns the height of a value, and the axis' tick and factor. */
+export function drawLevels({ pen, width, height, colour }: Sketch, low: number, high: number, unit: string) {
+  const bottom = height - BOTTOM;
+  const tick = tickDistance(high - low);
+  const [first, last] = [Math.ceil(low / tick - 1e-6), Math.ceil(high / tick - 1e-6)];
+  const y = (v: number) => bottom - ((v - low) / (last * tick - low)) * (bottom - TOP);
+  const [factor, prefix] = prefixed(Math.max(-low, last * tick));
+  pen.lineWidth = 1;
+  pen.fillStyle = colour("--faint");
+  pen.textAlign = "right";
+  pen.textBaseline = "middle";
+  for (let k = first; k <= last; k++) {
+    const at = Math.round(y(k * tick)) + 0.5;
+    pen.strokeStyle = colour(k === 0 ? "--faint" : "--line");
+    pen.beginPath();
+    pen.moveTo(LEFT, at);
+    pen.lineTo(width, at);
+    pen.stroke();
+    if (k % 2 !== 0 && ((bottom - TOP) * tick) / (last * tick - low) < 13) continue;
+    pen.fillText(tickText(k * tick, factor), LEFT - 5, at);
+  }
+  pen.textBaseline = "alphabetic";
+  pen.textAlign = "left";
+  pen.fillText(`${prefix}${unit}`, 0, 11);
+  return { y, tick, factor };
+}
+
+class Plot {
   constructor(
     private readonly canvas: HTMLCanvasElement,
     private readonly unit: string,
     private readonly lines: Line[],
-  ) {
-    this.pen = canvas.getContext("2d");
-  }
+  ) {}
 
   /** `least` is the smallest span that is shown: smaller changes are noise. */
   draw(history: Moment[], nowS: number, least: number): void {
-    const { pen, canvas } = this;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    if (!pen || width === 0) return;
-    const ratio = Math.min(devicePixelRatio, 2);
-    if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
-    if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, width, height);
-    const style = getComputedStyle(canvas);
+    const drawn = sketch(this.canvas);
+    if (!drawn) return;
+    const { pen, width, height, colour } = drawn;
     const bottom = height - BOTTOM;
     let [low, high] = [0, least];
     for (const moment of history) {
@@ -67,28 +113,9 @@ class Plot {
         high = Math.max(high, of(moment));
       }
     }
-    const tick = tickDistance(high - low);
-    const [first, last] = [Math.ceil(low / tick - 1e-6), Math.ceil(high / tick - 1e-6)];
-    const y = (v: number) => bottom - ((v - low) / (last * tick - low)) * (bottom - TOP);
+    const { y, tick, factor } = drawLevels(drawn, low, high, this.unit);
     const x = (t: number) => LEFT + (width - LEFT - 1) * (1 - (nowS - t) / HISTORY_S);
-    const [factor, prefix] = prefixed(Math.max(-low, last * tick));
-    pen.font = "11px system-ui, sans-serif";
-    pen.lineWidth = 1;
-    pen.fillStyle = style.getPropertyValue("--faint");
-    pen.textAlign = "right";
-    pen.textBaseline = "middle";
-    for (let k = first; k <= last; k++) {
-      const at = Math.round(y(k * tick)) + 0.5;
-      pen.strokeStyle = style.getPropertyValue(k === 0 ? "--faint" : "--line");
-      pen.beginPath();
-      pen.moveTo(LEFT, at);
-      pen.lineTo(width, at);
-      pen.stroke();
-      if (k % 2 !== 0 && ((bottom - TOP) * tick) / (last * tick - low) < 13) continue;
-      pen.fillText(String(Number((k * tick * factor).toPrecision(3))).replace("-", "−"), LEFT - 5, at);
-    }
-    pen.textBaseline = "alphabetic";
-    pen.strokeStyle = style.getPropertyValue("--faint");
+    pen.strokeStyle = colour("--faint");
     for (let s = 0; s <= HISTORY_S; s += TICK_S) {
       const at = Math.round(x(nowS - s)) - 0.5;
       pen.beginPath();
@@ -99,15 +126,14 @@ class Plot {
       pen.fillText(s === 0 ? "now" : `−${s} s`, at + (s === 0 ? 1 : 0), height - 2);
     }
     pen.textAlign = "left";
-    pen.fillText(`${prefix}${this.unit}`, 0, 11);
     let at = LEFT;
     const now = history.at(-1);
     pen.save();
     pen.beginPath();
     pen.rect(LEFT, 0, width - LEFT, height);
     pen.clip();
-    for (const { name, colour, of } of this.lines) {
-      pen.strokeStyle = pen.fillStyle = style.getPropertyValue(colour);
+    for (const { name, colour: variable, of } of this.lines) {
+      pen.strokeStyle = pen.fillStyle = colour(variable);
       const value = now && nowS - now.timeS < 0.5 ? of(now) : 0;
       const digits = Math.max(0, Math.ceil(-Math.log10(tick * factor)) + 1);
       const text = `${name} ${(value * factor).toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−")}`;

@@ -7,6 +7,7 @@
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { MAX_VERTICES, sceneOf, solidOf } from "./coefficients";
+import { isTable } from "./comparison";
 import type { MeshProblem, MeshReport, SceneSchema, Session } from "palpate/v1";
 import { part } from "./page";
 import { describe, CALL_TIMEOUT_MS, sessions } from "./server";
@@ -91,7 +92,11 @@ export class FileOpener {
   /** Cancels pending requests when the dialog closes. */
   private ending = new AbortController();
 
-  constructor(private readonly onSession: (session: Session, scene: Scene) => void) {
+  /** `onTable`: a table of curves was chosen or dropped. */
+  constructor(
+    private readonly onSession: (session: Session, scene: Scene) => void,
+    private readonly onTable: (file: File) => void,
+  ) {
     const chosen = part("own-file", HTMLInputElement);
     part("open-file", HTMLButtonElement).addEventListener("click", () => chosen.click());
     chosen.addEventListener("change", () => {
@@ -129,6 +134,7 @@ export class FileOpener {
   /** Processes a file from upload to session. */
   private async take(file: File): Promise<void> {
     this.ending.abort();
+    if (isTable(file)) return this.onTable(file);
     this.ending = new AbortController();
     const { signal } = this.ending;
     part("own-name", HTMLElement).textContent = file.name;

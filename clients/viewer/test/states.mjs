@@ -190,6 +190,14 @@ const STATES = {
     await page.page.locator("#own-problems li").first().waitFor();
     return { page };
   },
+  comparison: async (context) => {
+    const page = await shown(context, "?scene=paper");
+    const rows = Array.from({ length: 41 }, (_, k) => `60,${(0.0025 * k).toFixed(4)},${0.1 * k},${(0.02 * k + 0.02 * Math.sin(3 * k)).toFixed(4)}`);
+    const table = `tip_radius_mm,time_s,depth_mm,force_n\n${rows.join("\n")}\n`;
+    await page.page.setInputFiles("#compare-file", { name: "lab.csv", mimeType: "text/csv", buffer: Buffer.from(table) });
+    await page.until(({ comparison }) => comparison.curves > 0);
+    return { page };
+  },
   recording: async (context) => {
     const page = await shown(context, "");
     const id = new URL(page.page.url()).searchParams.get("session");
