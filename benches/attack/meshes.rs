@@ -23,7 +23,7 @@ async fn mesh(ground: &Ground, door: &Door, name: &str, file: &[u8], vertices: O
             part: file[offset..end].to_vec(),
             last: end == file.len(),
             unit: "m".into(),
-            repair: false,
+            ..Default::default()
         };
         mesh_id = sessions(door).upload_mesh(request).await?.into_inner().mesh_id;
     }

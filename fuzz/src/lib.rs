@@ -180,9 +180,14 @@ pub const REQUESTS: &[(&str, Taker)] = &[
     }),
     ("UploadMeshRequest", |bytes| {
         pb::UploadMeshRequest::decode(bytes).is_ok_and(|request| {
-            let Ok(unit) = request.unit.parse() else { return false };
+            let (unit, label) = (request.unit.parse().ok(), request.label.map(i64::from));
+            if unit.is_none() && label.is_none() {
+                return false;
+            }
             let within = palpate_geometry::ReadLimits { bytes: 1 << 16, vertices: 1000, triangles: 4000 };
-            palpate_geometry::read(&request.file_name, &request.part, unit, &|_| None, &within).is_ok_and(|read| {
+            let (name, part, mut pay) = (&request.file_name, &request.part, |_: u64| true);
+            let read = palpate_geometry::read_paid(name, part, label, unit, &|_| None, &within, &mut pay);
+            read.is_ok_and(|read| {
                 let report = palpate_geometry::report(&read.mesh);
                 report.refusal().is_some() || Mesh::of(read.mesh, 0.01, FixedVertices::Rim).is_ok()
             })
@@ -425,9 +430,10 @@ fn request_seeds() -> Vec<Vec<u8>> {
         part: part.to_vec(),
         last: true,
         unit: "mm".into(),
+        label: (file_name == "two.nrrd").then_some(2),
         ..Default::default()
     };
-    let uploads: [(&str, &[u8]); 4] = [
+    let uploads: [(&str, &[u8]); 5] = [
         ("organ.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"),
         ("organ.inp", b"*NODE\n1\n2,1\n3,0,1\n4,0,0,1\n*ELEMENT,TYPE=C3D4,ELSET=a\n1,1,2,3,4\n"),
         (
@@ -435,6 +441,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             b"MeshVersionFormatted 2\nDimension 3\nVertices 4\n0 0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\nTetrahedra 1\n1 2 3 4 5\nEnd\n",
         ),
         ("organ.nrrd", b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\x01\x01\x01\x01\0\0\0\0"),
+        ("two.nrrd", b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n\x01\x01\x02\x02\0\0\0\0"),
     ];
     let vertices = pb::probe_request::Where::Vertices(pb::Vertices { vertices: vec![2, 0] });
     let watch = pb::WatchSamplesRequest { deadband: Some(deadband), heartbeat_s: Some(1.0), ..Default::default() };

@@ -4599,12 +4599,18 @@ pub struct UploadMeshRequest {
     /// Whether this is the last part: then the mesh is read and checked.
     #[prost(bool, tag = "5")]
     pub last: bool,
-    /// The length of 1 in the file: "m", "cm", "mm" or a number of metres. Required with the last part.
+    /// The length of 1 in the file: "m", "cm", "mm" or a number of metres. Required with the last part, unless that has a
+    /// `label`: then that of the file counts if it is empty, or mm if the file states none.
     #[prost(string, tag = "6")]
     pub unit: ::prost::alloc::string::String,
     /// With the last part: repair what can be repaired (`palpate mesh --repair`), and report it.
     #[prost(bool, tag = "7")]
     pub repair: bool,
+    /// With the last part: the label of a label map (NRRD, NIfTI, DICOM), whose voxels are inside. Not needed if the file
+    /// has one label alone. INVALID_ARGUMENT with the field `label` and the labels of the file if it is missing or no
+    /// voxel has it.
+    #[prost(uint32, optional, tag = "8")]
+    pub label: ::core::option::Option<u32>,
 }
 impl ::prost::Name for UploadMeshRequest {
     const NAME: &'static str = "UploadMeshRequest";

@@ -723,6 +723,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Text },
 Field { number: 5, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 8, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.UploadMeshResponse", bytes: size_of::<crate::pb::UploadMeshResponse>(), decode: |bytes| <crate::pb::UploadMeshResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use palpate_geometry::prepare::prepare;
 use palpate_geometry::repair::{Repair, repair};
 use palpate_geometry::report::{Border, Finding};
-use palpate_geometry::{Element, MeshError, ReadLimits, TriangleMesh, Unit, VolumeRegion};
+use palpate_geometry::{Element, MeshError, Problem, ReadLimits, TriangleMesh, Unit, VolumeRegion};
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, scene};
 
@@ -35,11 +35,28 @@ pub(crate) struct Meshes {
     vertices: usize,
 }
 
+/// How a file is read: the unit of its lengths, unless that of a label map counts, and the label.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ReadAs {
+    unit: Option<Unit>,
+    label: Option<i64>,
+}
+
+/// Parses how the file of a request is read.
+///
+/// # Errors
+/// Refuses a unit that is none, and its absence without a label.
+pub(super) fn read_as(request: &pb::UploadMeshRequest) -> Result<ReadAs> {
+    let label = request.label.map(i64::from);
+    let is_own = label.is_some() && request.unit.is_empty();
+    Ok(ReadAs { unit: if is_own { None } else { Some(unit(&request.unit)?) }, label })
+}
+
 /// Parses the unit of length in a request.
 ///
 /// # Errors
 /// Refuses an empty text and one that is not a unit.
-pub(super) fn unit(text: &str) -> Result<Unit> {
+fn unit(text: &str) -> Result<Unit> {
     if text.is_empty() {
         let message = "is missing: mesh files do not state theirs; \"m\", \"cm\", \"mm\" or so many metres";
         return Err(Refusal::new(Reason::Missing, "unit", message));
@@ -137,11 +154,11 @@ impl UploadReading {
     ///
     /// # Errors
     /// Refuses a file that can't be read (with element and place), too little memory, and when `stop` is set.
-    pub(super) fn finish(mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
-        memory::attempt("part", || self.finished(unit, mends, stop))
+    pub(super) fn finish(mut self, how: ReadAs, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
+        memory::attempt("part", || self.finished(how, mends, stop))
     }
 
-    fn finished(&mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
+    fn finished(&mut self, ReadAs { unit, label }: ReadAs, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
         let go_on = || if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) };
         let limits = &self.limits;
         let bytes = std::mem::take(&mut self.received.bytes);
@@ -152,7 +169,7 @@ impl UploadReading {
             paid = self.received.charge(kept.saturating_add(reading));
             paid.is_ok()
         };
-        let read = palpate_geometry::read_paid(&self.name, &bytes, unit, &|_| None, limits, &mut pay);
+        let read = palpate_geometry::read_paid(&self.name, &bytes, label, unit, &|_| None, limits, &mut pay);
         paid?;
         let read = read.map_err(refuse)?;
         drop(bytes);
@@ -232,7 +249,12 @@ fn hole(border: &Border) -> pb::MeshProblem {
 
 /// Returns the refusal of a file that can't be read. The message contains element and place.
 fn refuse(error: MeshError) -> Refusal {
-    Refusal::new(Reason::Unreadable, "part", error.to_string())
+    let (reason, field) = match error.problem {
+        Problem::LabelMissing { .. } => (Reason::Missing, "label"),
+        Problem::LabelUnknown { .. } => (Reason::OutOfRange, "label"),
+        _ => (Reason::Unreadable, "part"),
+    };
+    Refusal::new(reason, field, error.to_string())
 }
 
 #[cfg(test)]
@@ -256,7 +278,8 @@ mod tests {
     fn sent(meshes: &Meshes, account: &Account) -> String {
         let id = meshes.add(&part("", 0, TETRAHEDRON.as_bytes()), account).unwrap().mesh_id;
         let reading = meshes.read(&id, "organ.obj", account).unwrap();
-        let report = reading.finish(unit("mm").unwrap(), false, &AtomicBool::new(false)).unwrap();
+        let report =
+            reading.finish(ReadAs { unit: unit("mm").ok(), label: None }, false, &AtomicBool::new(false)).unwrap();
         assert!(!report.refused && report.vertices == 4 && report.volume_m3.is_some(), "{report:?}");
         id
     }
@@ -312,7 +335,7 @@ mod tests {
         let finish = |text: &str, mends: bool, stop: bool| {
             let id = meshes.add(&part("", 0, text.as_bytes()), &one).unwrap().mesh_id;
             let reading = meshes.read(&id, "organ.obj", &one).unwrap();
-            let report = reading.finish(unit("m").unwrap(), mends, &AtomicBool::new(stop));
+            let report = reading.finish(ReadAs { unit: unit("m").ok(), label: None }, mends, &AtomicBool::new(stop));
             (meshes.get(&id, &one).is_ok(), report)
         };
         let (is_kept, refused) = finish("v 0 0\nf 1 2 3\n", false, false);

@@ -159,11 +159,11 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::UploadMeshResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let unit = if request.last { Some(meshes::unit(&request.unit)?) } else { None };
+        let how = if request.last { Some(meshes::read_as(&request)?) } else { None };
         let mut answer = self.0.meshes.add(&request, &account)?;
-        let Some(unit) = unit else { return Ok(Response::new(answer)) };
+        let Some(how) = how else { return Ok(Response::new(answer)) };
         let reading = self.0.meshes.read(&answer.mesh_id, &request.file_name, &account)?;
-        let read = move |cancel: &CancelFlag| reading.finish(unit, request.repair, cancel.flag());
+        let read = move |cancel: &CancelFlag| reading.finish(how, request.repair, cancel.flag());
         let report = self.0.job_pool.work(&account, read).await??;
         info!(
             caller = account.name(),

@@ -398,6 +398,7 @@ async fn upload(
             last: index + 1 == count,
             unit: unit.into(),
             repair,
+            label: None,
         };
         answer = sessions.upload_mesh(request).await?.into_inner();
     }
@@ -463,6 +464,74 @@ async fn a_mesh_that_a_client_sends_makes_the_session_that_its_file_does() {
     }
     let all = fixed(pb::mesh::Fixed::FixedGroup("cap".into()));
     server.create(Source::Scene(all), true).await.unwrap();
+}
+
+/// A label map of 12 × 10 × 10 voxels of 5 mm: 4 × 6 × 6 of the label 3, and as many of 7 beside them.
+fn scan() -> Vec<u8> {
+    let mut file = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 12 10 10\nencoding: raw\n\
+        space: left-posterior-superior\nspace directions: (5,0,0) (0,5,0) (0,0,5)\nspace units: \"mm\" \"mm\" \"mm\"\n\n"
+        .to_vec();
+    let label = |n: usize| {
+        let is_inner = [(n / 12 % 10, 10), (n / 120, 10)].iter().all(|(at, side)| (2..side - 2).contains(at));
+        match n % 12 {
+            2..6 if is_inner => 3,
+            6..10 if is_inner => 7,
+            _ => 0,
+        }
+    };
+    file.extend((0..1200).map(label));
+    file
+}
+
+#[tokio::test]
+async fn a_label_of_an_uploaded_scan_becomes_a_solid_and_another_one_is_refused_with_those_of_the_file() {
+    let server = TestServer::start(&[]);
+    let upload = async |unit: &str, label| {
+        let mut sessions = server.sessions().await;
+        let request = pb::UploadMeshRequest {
+            file_name: "scan.nrrd".into(),
+            part: scan(),
+            last: true,
+            unit: unit.into(),
+            label,
+            ..Default::default()
+        };
+        sessions.upload_mesh(request).await.map(tonic::Response::into_inner)
+    };
+    // 144 voxels of 125 mm³, in the unit that the file states, or in another one.
+    for (unit, volume_m3) in [("", 18e-6), ("mm", 18e-6), ("cm", 18e-3)] {
+        let sent = upload(unit, Some(7)).await.unwrap();
+        let report = sent.report.unwrap();
+        assert!((report.volume_m3.unwrap() / volume_m3 - 1.0).abs() < 1e-3, "{unit}: {report:?}");
+        assert!(!report.refused && report.holes == 0, "{report:?}");
+        let least = report.extent.unwrap().least_m.unwrap();
+        // Corners are rounded, and the volume is that of the voxels: the sides are half a voxel farther out.
+        let voxel_m = if unit == "cm" { 0.05 } else { 0.005 };
+        assert!((least.x / voxel_m - 5.0).abs() < 0.5 && (least.y / voxel_m - 1.0).abs() < 0.5, "{least:?}");
+    }
+    let sent = upload("", Some(3)).await.unwrap();
+    let solid = pb::Solid {
+        mesh_id: sent.mesh_id,
+        cells: Some(500),
+        youngs_modulus_pa: Some(8e3),
+        poissons_ratio: Some(0.45),
+        foundation_n_per_m3: Some(2e4),
+        ..Default::default()
+    };
+    let scene = pb::Scene { name: "scan".into(), solid: Some(solid), ..Default::default() };
+    let session = server.create(Source::Scene(scene), true).await.unwrap();
+    assert!(session.points > 100, "{session:?}");
+    for (unit, label, reason, field, says) in [
+        ("mm", None, "MISSING", "label", "choose one of its labels 3, 7"),
+        ("mm", Some(4), "OUT_OF_RANGE", "label", "no voxel has the label 4: there are 3, 7"),
+        ("mm", Some(0), "OUT_OF_RANGE", "label", "no voxel has the label 0: there are 3, 7"),
+        ("ell", Some(3), "WRONG_KIND", "unit", "must be"),
+        ("", None, "MISSING", "unit", "is missing"),
+    ] {
+        let refused = upload(unit, label).await.unwrap_err();
+        assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), field.into()), "{refused:?}");
+        assert!(refused.message().contains(says), "{}", refused.message());
+    }
 }
 
 async fn delete_journal(server: &TestServer, id: &str) -> Result<u32, Status> {

@@ -308,7 +308,7 @@ fn create_own(
     let mut mesh_id = String::new();
     if let Some(MeshToSend { name, bytes, unit }) = &to_send.upload {
         let calls = u32::try_from(bytes.len() / PART_BYTES).unwrap_or(u32::MAX).saturating_add(1);
-        let answer = shared.wait_for(calls, upload_mesh(shared.channel.clone(), name, bytes, unit, false))?;
+        let answer = shared.wait_for(calls, upload_mesh(shared.channel.clone(), name, bytes, unit, None, false))?;
         if let Some(report) = answer.report.filter(|report| report.refused) {
             let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
             return Err(CodedError::argument(format!("the mesh can't be used: {}", what.unwrap_or_default())));

@@ -19,14 +19,15 @@ fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
 }
 
 /// Uploads `file`, the bytes of a mesh's file called `file_name`, in parts one after another. `unit` is the length of
-/// 1 in it: "m", "cm", "mm" or a number of metres. If `repair` is true, the server repairs faults. The answer contains
-/// the `mesh_id` for `Scene.mesh`, and a report of whether the mesh can be used: faults of the mesh are no error here
+/// 1 in it: "m", "cm", "mm" or a number of metres. Of a label map with several labels (NRRD, NIfTI, DICOM), `label` is the one
+/// whose voxels are inside; then `unit` may be empty, for that of the file. If `repair` is true, the server repairs faults. The
+/// answer contains the `mesh_id` for `Scene.mesh`, and a report of whether the mesh can be used: faults of the mesh are no error here
 /// (`report.refused`).
 ///
 /// ```no_run
 /// # async fn example(channel: palpate_client::Channel) -> Result<(), Box<dyn std::error::Error>> {
 /// let file = std::fs::read("kidney.stl")?;
-/// let sent = palpate_client::upload::upload_mesh(channel, "kidney.stl", &file, "mm", true).await?;
+/// let sent = palpate_client::upload::upload_mesh(channel, "kidney.stl", &file, "mm", None, true).await?;
 /// println!("mesh {}: {:?}", sent.mesh_id, sent.report);
 /// # Ok(())
 /// # }
@@ -39,13 +40,14 @@ pub async fn upload_mesh(
     file_name: &str,
     file: &[u8],
     unit: &str,
+    label: Option<u32>,
     repair: bool,
 ) -> Result<pb::UploadMeshResponse, Status> {
     let mut sessions = SessionServiceClient::new(channel);
     let mut answer = pb::UploadMeshResponse::default();
     for (offset, part, last) in parts(file) {
         let (mesh_id, file_name, unit) = (answer.mesh_id, file_name.to_owned(), unit.to_owned());
-        let request = pb::UploadMeshRequest { mesh_id, file_name, offset, part, last, unit, repair };
+        let request = pb::UploadMeshRequest { mesh_id, file_name, offset, part, last, unit, repair, label };
         answer = sessions.upload_mesh(request).await?.into_inner();
     }
     Ok(answer)

@@ -37,7 +37,7 @@ impl SessionSource {
         };
         let mut mesh_id = String::new();
         if let Some(MeshToSend { name, bytes, unit }) = &scene.upload {
-            let answer = upload_mesh(channel, name, bytes, unit, false).await.map_err(of_status)?;
+            let answer = upload_mesh(channel, name, bytes, unit, None, false).await.map_err(of_status)?;
             if let Some(report) = answer.report.filter(|report| report.refused) {
                 let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
                 return Err(refused(Refusal::new(Reason::OutOfRange, "scene", what.unwrap_or_default())));

@@ -74,7 +74,7 @@ impl SceneFile {
         };
         let mut mesh_id = String::new();
         if let Some(MeshToSend { name, bytes, unit }) = &to_send.upload {
-            let sent = upload_mesh(channel, name, bytes, unit, false).await?;
+            let sent = upload_mesh(channel, name, bytes, unit, None, false).await?;
             if let Some(report) = sent.report.filter(|report| report.refused) {
                 let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
                 return Err(Error::Argument(format!("{name}: {}", what.unwrap_or_default())));

@@ -31,6 +31,7 @@ export {
   keepOpen,
   CALL_TIMEOUT_MS,
   reasonOf,
+  fieldOf,
   Server,
   sleep,
 } from "./server.js";

@@ -206,6 +206,11 @@ export function reasonOf(error: unknown): string {
   return ConnectError.from(error).findDetails(ErrorInfoSchema)[0]?.reason ?? "";
 }
 
+/** Returns the field of the request that the server refused; empty if it named none. */
+export function fieldOf(error: unknown): string {
+  return ConnectError.from(error).findDetails(ErrorInfoSchema)[0]?.metadata.field ?? "";
+}
+
 /** If a call was refused because another server of the fleet owns the session, returns the URL of that server. */
 export function elsewhere(error: unknown): string | undefined {
   const info = ConnectError.from(error).findDetails(ErrorInfoSchema)[0];

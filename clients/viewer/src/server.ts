@@ -6,7 +6,7 @@ import type { WatchExerciseResponse } from "palpate/v1";
 export const server = new Server(location.origin);
 export const { sessions, haptics, exercises, received } = server;
 
-export { backoffMs, describe, type Failure, isGone, isPassing, isUnimplemented, keepOpen, CALL_TIMEOUT_MS, reasonOf, sleep } from "palpate";
+export { backoffMs, describe, type Failure, fieldOf, isGone, isPassing, isUnimplemented, keepOpen, CALL_TIMEOUT_MS, reasonOf, sleep } from "palpate";
 
 /** Returns what the stream of an exercise tells first, and ends the stream, which would keep its connection otherwise. */
 export async function exerciseNow(sessionId: string, signal?: AbortSignal): Promise<WatchExerciseResponse | undefined> {

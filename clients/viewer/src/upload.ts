@@ -9,8 +9,8 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import { MAX_VERTICES, sceneOf, solidOf } from "./coefficients";
 import { isTable } from "./comparison";
 import type { MeshProblem, MeshReport, SceneSchema, Session } from "palpate/v1";
-import { part } from "./page";
-import { describe, CALL_TIMEOUT_MS, sessions } from "./server";
+import { element, part } from "./page";
+import { describe, fieldOf, CALL_TIMEOUT_MS, sessions } from "./server";
 import { excerpt } from "./text";
 
 /** Size of a part, bytes. */
@@ -32,6 +32,13 @@ const UNITS = [
 type Kind = "surface" | "solid";
 
 type Scene = MessageInitShape<typeof SceneSchema>;
+
+/** How the server reads a file: the length of 1 in it, empty for that of a label map, its label, and whether it mends it. */
+interface ReadAs {
+  unit: string;
+  label?: number;
+  repair?: boolean;
+}
 
 /** A mesh that the server has received, with its report. */
 interface Sent {
@@ -150,15 +157,13 @@ export class FileOpener {
 
   private async lead(file: File, signal: AbortSignal): Promise<void> {
     if (file.size === 0) throw new Error("the file is empty");
-    let sent = await this.send(file, "m", false, signal);
-    const raw = sidesOf(sent.report);
-    const chosen = await this.askUnit(raw, sent.kept, signal);
-    const { unit } = chosen;
-    if (unit !== "m") sent = await this.send(file, unit, false, signal);
-    let kind = await this.showReport(sent.report, chosen, false, signal);
+    const read = await this.read(file, signal);
+    const { how, unit } = read;
+    let sent = read.sent;
+    let kind = await this.showReport(sent.report, unit, false, signal);
     if (kind === "mend") {
-      sent = await this.send(file, unit, true, signal);
-      kind = await this.showReport(sent.report, chosen, true, signal);
+      sent = await this.send(file, { ...how, repair: true }, signal);
+      kind = await this.showReport(sent.report, unit, true, signal);
     }
     if (kind === "mend") throw new Ended();
     this.show(kind === "solid" ? "Filling it with cells …" : "Making the tissue …");
@@ -169,8 +174,38 @@ export class FileOpener {
     if (session) this.onSession(session, scene);
   }
 
+  /** Sends a file, and asks the user for what it does not say: its unit, or which of its labels. */
+  private async read(file: File, signal: AbortSignal): Promise<{ sent: Sent; how: ReadAs; unit: (typeof UNITS)[number] }> {
+    let sent: Sent;
+    try {
+      sent = await this.send(file, { unit: "m" }, signal);
+    } catch (error) {
+      if (fieldOf(error) !== "label") throw error;
+      // A label map says how large it is.
+      const how = { unit: "", label: await this.askLabel(describe(error), signal) };
+      return { sent: await this.send(file, how, signal), how, unit: UNITS[0] };
+    }
+    const unit = await this.askUnit(sidesOf(sent.report), sent.kept, signal);
+    const how = { unit: unit.unit };
+    return { sent: unit.unit === "m" ? sent : await this.send(file, how, signal), how, unit };
+  }
+
+  /** Asks for one of the labels of a label map, which `said` lists. */
+  private async askLabel(said: string, signal: AbortSignal): Promise<number> {
+    // What is an option on the command line is a field here.
+    this.show(`${excerpt(said).replace(/ \(label = N[^)]*\)/, "")}.`);
+    const label = element("label", { textContent: "Label " });
+    const chosen = element("input", { type: "number", min: "1", max: "4294967295", step: "1", value: /labels (\d+)/.exec(said)?.[1] ?? "1" });
+    label.append(chosen);
+    this.units.replaceChildren(label);
+    this.units.hidden = false;
+    do await this.ask([["use", "Go on"]], signal);
+    while (!chosen.reportValidity());
+    return chosen.valueAsNumber;
+  }
+
   /** Sends a file in parts, one after the other. */
-  private async send(file: File, unit: string, repair: boolean, signal: AbortSignal): Promise<Sent> {
+  private async send(file: File, how: ReadAs, signal: AbortSignal): Promise<Sent> {
     this.show(`Sending ${(file.size / 1e6).toFixed(1)} MB …`);
     this.progress.hidden = false;
     this.progress.value = 0;
@@ -178,8 +213,8 @@ export class FileOpener {
     for (let offset = 0; ; offset += PART_BYTES) {
       const bytes = new Uint8Array(await file.slice(offset, offset + PART_BYTES).arrayBuffer());
       const last = offset + PART_BYTES >= file.size;
-      if (last) this.said.textContent = repair ? "The server mends the mesh …" : "The server reads the mesh …";
-      const request = { meshId, fileName: file.name, offset: BigInt(offset), part: bytes, last, unit, repair };
+      if (last) this.said.textContent = how.repair ? "The server mends the mesh …" : "The server reads the mesh …";
+      const request = { meshId, fileName: file.name, offset: BigInt(offset), part: bytes, last, ...how };
       const answer = await sessions.uploadMesh(request, { signal, timeoutMs: last ? READING_MS : CALL_TIMEOUT_MS });
       meshId = answer.meshId;
       this.progress.value = Math.min(1, (offset + bytes.length) / file.size);

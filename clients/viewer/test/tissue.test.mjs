@@ -235,4 +235,34 @@ describe("a body of any shape", () => {
     assert.deepEqual(page.complaints, []);
     await close(page);
   });
+
+  test("comes as a solid from a label of a scan, which the page asks for", async () => {
+    const page = await open(`${organs.url}/?scene=patch`);
+    const header = 'NRRD0004\ntype: uchar\ndimension: 3\nsizes: 24 20 20\nencoding: raw\nspace: left-posterior-superior\nspace directions: (5,0,0) (0,5,0) (0,0,5)\nspace units: "mm" "mm" "mm"\n\n';
+    const isInside = (/** @type {number} */ at, /** @type {number} */ side) => at >= 3 && at < side - 3;
+    const label = (/** @type {number} */ n) => {
+      const [x, y, z] = [n % 24, Math.floor(n / 24) % 20, Math.floor(n / 480)];
+      return isInside(y, 20) && isInside(z, 20) && isInside(x, 24) ? (x < 12 ? 3 : 7) : 0;
+    };
+    const voxels = Array.from({ length: 9600 }, (_, n) => String.fromCharCode(label(n)));
+    await dropFile(page, "scan.nrrd", header + voxels.join(""));
+    await page.says("own-said", /scan\.nrrd: the file is a label map: choose one of its labels 3, 7\.$/);
+    assert.equal(await page.page.locator("#own-units input").inputValue(), "3");
+    await page.page.fill("#own-units input", "7");
+    await page.page.click("#own-buttons button.main");
+    // 9 × 14 × 14 voxels of 5 mm, rounded at the edges.
+    await page.says("own-said", /4\d\.?\d? × [67]\d\.?\d? × [67]\d\.?\d? mm/);
+    await page.picture("label");
+    await page.page.click("#own-buttons button:text('Touch it as a solid')");
+    await page.says("connection", /Connected to scan/);
+    await page.page.locator("#own").waitFor({ state: "hidden" });
+    await page.press();
+    await felt(page);
+    await page.page.mouse.up();
+    assert.deepEqual(
+      page.complaints.filter((complaint) => !complaint.includes("Failed to load resource")),
+      [],
+    );
+    await close(page);
+  });
 });

@@ -26,6 +26,16 @@ pub enum Problem {
         /// The variant, and what to do.
         message: String,
     },
+    /// The file is a label map of several labels, of which none was chosen.
+    LabelMissing {
+        /// The first labels of the file, at most 20, ascending, as text.
+        labels: String,
+    },
+    /// No voxel of a label map has the chosen label.
+    LabelUnknown {
+        /// The label, and those of the file.
+        message: String,
+    },
     /// The file ends too early.
     Truncated {
         /// What is missing.
@@ -129,6 +139,8 @@ impl Problem {
             Problem::UnknownFormat => "unknown_format",
             Problem::Syntax { .. } => "syntax",
             Problem::Unsupported { .. } => "unsupported",
+            Problem::LabelMissing { .. } => "label_missing",
+            Problem::LabelUnknown { .. } => "label_unknown",
             Problem::Truncated { .. } => "truncated",
             Problem::NeighbourMissing { .. } => "neighbour_missing",
             Problem::TooLarge { .. } => "too_large",
@@ -195,7 +207,13 @@ impl fmt::Display for Problem {
                 "the format is not known: give a file that ends in .obj, .stl, .ply, .gltf, .glb, .msh, .vtk, .vtp, .vtu, .mesh, \
                  .meshb, .node, .ele, .inp, .nrrd, .nii, .nii.gz or .dcm"
             ),
-            Problem::Syntax { message } | Problem::Unsupported { message } => f.write_str(message),
+            Problem::Syntax { message } | Problem::Unsupported { message } | Problem::LabelUnknown { message } => {
+                f.write_str(message)
+            }
+            Problem::LabelMissing { labels } => write!(
+                f,
+                "the file is a label map: choose one of its labels {labels} (label = N of a scene, --label N)"
+            ),
             Problem::Truncated { missing } => {
                 write!(f, "the file ends early: {missing} is missing; copy or export it again")
             }

@@ -43,7 +43,7 @@ fn try_one(name: &str, bytes: &[u8], most: &mut BTreeMap<String, Most>) -> bool 
     };
     let limits = ReadLimits::default();
     let (read, took) =
-        counted(|| read_paid(name, bytes, Unit::METRE, &|_| None, &limits, &mut pay).map(|read| read.mesh));
+        counted(|| read_paid(name, bytes, None, Some(Unit::METRE), &|_| None, &limits, &mut pay).map(|read| read.mesh));
     // A label map may unpack to far more than its bytes: its cells have a limit of their own.
     let is_label_map = [".nrrd", ".nii", ".gz", ".dcm"].iter().any(|end| name.ends_with(end));
     let room = if is_label_map { ROOM + CELLS } else { ROOM };

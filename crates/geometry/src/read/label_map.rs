@@ -115,16 +115,11 @@ impl LabelMap<'_> {
         match (label, labels.first_key_value()) {
             (_, None) => Err(Problem::Unsupported { message: "all voxels are 0: there is no label".to_owned() }),
             (None, Some((label, extent))) if labels.len() == 1 => Ok((*label, *extent)),
-            (None, Some(_)) => {
-                let message = format!(
-                    "the file is a label map: choose one of its labels {listed} (label = N of a scene, --label N)"
-                );
-                Err(Problem::Unsupported { message })
-            }
+            (None, Some(_)) => Err(Problem::LabelMissing { labels: listed }),
             (Some(label), Some(_)) => {
-                let missing =
-                    || Problem::Unsupported { message: format!("no voxel has the label {label}: there are {listed}") };
-                labels.get(&label).map(|extent| (label, *extent)).ok_or_else(missing)
+                let unknown =
+                    || Problem::LabelUnknown { message: format!("no voxel has the label {label}: there are {listed}") };
+                labels.get(&label).map(|extent| (label, *extent)).ok_or_else(unknown)
             }
         }
     }

@@ -183,23 +183,7 @@ pub fn read(
     neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
     limits: &ReadLimits,
 ) -> Result<ReadMesh, MeshError> {
-    read_paid(name, bytes, unit, neighbours, limits, &mut |_| true)
-}
-
-/// Reads a mesh file like [`read`], with memory paid by `pay`: before memory is allocated, it is called with the total
-/// number of bytes for this file so far, a rising number, about 256 KiB in advance. It returns `false` to refuse.
-///
-/// # Errors
-/// Returns the refusals of [`read`], and [`Problem::TooLarge`] if `pay` refuses.
-pub fn read_paid(
-    name: &str,
-    bytes: &[u8],
-    unit: Unit,
-    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
-    limits: &ReadLimits,
-    pay: &mut dyn FnMut(u64) -> bool,
-) -> Result<ReadMesh, MeshError> {
-    read_any(name, bytes, None, Some(unit), neighbours, limits, pay)
+    read_paid(name, bytes, None, Some(unit), neighbours, limits, &mut |_| true)
 }
 
 /// Reads the surface around a label of a label map (NRRD, NIfTI or DICOM) like [`read`]: a closed surface without the stairs of
@@ -215,10 +199,16 @@ pub fn read_label(
     unit: Option<Unit>,
     limits: &ReadLimits,
 ) -> Result<ReadMesh, MeshError> {
-    read_any(name, bytes, Some(label), unit, &|_| None, limits, &mut |_| true)
+    read_paid(name, bytes, Some(label), unit, &|_| None, limits, &mut |_| true)
 }
 
-fn read_any(
+/// Reads a mesh file like [`read`], or with a `label` like [`read_label`], with memory paid by `pay`: before memory is allocated,
+/// it is called with the total number of bytes for this file so far, a rising number, about 256 KiB in advance. It returns `false`
+/// to refuse. Without `unit`, it is the one that a label map states, or else mm, and m of other files.
+///
+/// # Errors
+/// Returns the refusals of [`read`] or [`read_label`], and [`Problem::TooLarge`] if `pay` refuses.
+pub fn read_paid(
     name: &str,
     bytes: &[u8],
     label: Option<i64>,
