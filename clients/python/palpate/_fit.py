@@ -32,7 +32,7 @@ class Fit:
     and `units` its unit. `untold` has the reason for each parameter that the curves can't tell, which keeps its value.
     `correlations` are those between the errors of each two parameters, in the order of `values`. `fitted_n` and `residual_n` (fitted −
     measured) have an array for each curve. `rms_n` is the root of the mean square of all residuals, `relative_rms` the same divided by
-    the largest force, `noise_n` the standard deviation of the noise. `autocorrelation` is the correlation between a residual and the
+    the largest force, `noise_of_curves_n` the standard deviation of the noise of each curve. `autocorrelation` is the correlation between a residual and the
     next one, 0 if it is within what chance makes. `runs` counts the runs of a curve. `scene` has the fitted values.
     """
 
@@ -47,7 +47,7 @@ class Fit:
     rms_n: float
     relative_rms: float
     r_squared: float
-    noise_n: float
+    noise_of_curves_n: list
     autocorrelation: float
     runs: int
     warnings: list

@@ -111,7 +111,7 @@ pub(crate) fn fit<'py>(
     given.set_item("rms_n", found.residual.rms_n)?;
     given.set_item("relative_rms", found.residual.relative_rms)?;
     given.set_item("r_squared", found.residual.r_squared)?;
-    given.set_item("noise_n", found.noise_n)?;
+    given.set_item("noise_of_curves_n", &found.noise_of_curves_n)?;
     given.set_item("autocorrelation", found.autocorrelation)?;
     given.set_item("runs", found.runs)?;
     given.set_item("warnings", &found.warnings)?;

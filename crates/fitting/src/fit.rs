@@ -4,6 +4,9 @@
 //! where a linear problem ends: the force of a slow press grows in proportion to all stiffnesses, and what viscosity, damping and
 //! branches add in proportion to them; one run for each tells all of these at once.
 //!
+//! **Noise.** First that of all samples counts as the same. If the residuals of curves differ by more than chance makes, each curve has its
+//! own, and the search goes on with samples weighted by it, until the noise stays.
+//!
 //! **What is refused.** A parameter that the data can't tell, by its 95 % interval ([`Scale::is_too_wide`]): refused if it was asked for;
 //! otherwise it keeps the value of the scene, and the others are fitted again.
 
@@ -17,11 +20,12 @@ use palpate_tissue::scene::tissue_parameter::TissueParameter;
 use palpate_tissue::scene::{Named, Scene};
 
 use super::curve_file::MeasuredCurve;
+use super::noise::{noise_of_curves, weights};
 use super::options::{FitOptions, FitProgress};
 use super::residual::{Residual, differences, rms};
 use super::runs::Runs;
 use super::scale::Scale;
-use super::search::{Minimum, minimize};
+use super::search::{Minimum, WeightedSamples, minimize};
 use super::uncertainty::{MeasuredSamples, Uncertainty};
 
 /// The part of the largest force by which runs err at least: the noise of a measurement counts as no smaller.
@@ -37,6 +41,10 @@ const FINER: f64 = 2.0;
 
 /// The part of an interval from which on a warning names the error of runs in it.
 const NAMED: f64 = 0.5;
+
+/// Rounds in which the noise of the curves is estimated again, at most; and the factor within which it stays.
+const ROUNDS: usize = 4;
+const STAYS: f64 = 1.2;
 
 /// A correlation from which two parameters are named as told only together.
 const TOGETHER: f64 = 0.95;
@@ -80,8 +88,9 @@ pub struct Fit {
     pub fitted_n: Vec<Vec<f64>>,
     /// What is between these and the measured ones.
     pub residual: Residual,
-    /// Standard deviation of the noise of a sample, N, from the residuals.
-    pub noise_n: f64,
+    /// Standard deviation of the noise of a sample of each curve, N, from the residuals: equal unless these differ by more than chance
+    /// makes.
+    pub noise_of_curves_n: Vec<f64>,
     /// Correlation between a residual and the next one; 0 if it is within what chance makes of independent ones.
     pub autocorrelation: f64,
     /// Curves that were run: each counts as often as it was.
@@ -98,14 +107,22 @@ struct Active {
     scale: Scale,
 }
 
+/// The least squares of what is fitted now.
+struct LeastSquares {
+    minimum: Minimum,
+    uncertainty: Uncertainty,
+    /// Standard deviation of the noise of each curve, N.
+    noise_of_curves_n: Vec<f64>,
+}
+
 struct Fitter<'f> {
     runs: Runs<'f>,
     /// The scene with the values of what is not fitted.
     scene: Scene,
 }
 
-/// Fits parameters of the scene of `model` to curves. The sums of squares and the intervals are those of equal, independent errors of
-/// all forces; if neighbouring residuals are correlated, the intervals are wider for it. Blocks for many runs.
+/// Fits parameters of the scene of `model` to curves. The sums of squares and the intervals are those of independent errors, equal in
+/// each curve; if neighbouring residuals are correlated, the intervals are wider for it. Blocks for many runs.
 ///
 /// # Errors
 /// Refuses no curve, curves with fewer samples than parameters, a parameter that the scene does not have or that is 0 in it, a parameter
@@ -154,14 +171,15 @@ impl Fitter<'_> {
         let mut untold = Vec::new();
         loop {
             let active = self.begin(&names)?;
-            let (minimum, uncertainty) = self.minimum(&active)?;
+            let found = self.minimum(&active)?;
+            let LeastSquares { minimum, uncertainty, .. } = &found;
             let is_untold =
                 |index: &usize| active[*index].scale.is_too_wide(minimum.x[*index], uncertainty.half_widths[*index]);
             let Some(last) = (0..active.len()).rev().find(is_untold) else {
-                return self.finish(&original, &active, &minimum, uncertainty, untold);
+                return self.finish(&original, &active, found, untold);
             };
             let parameter = active[last].parameter;
-            let reason = reason(&active, last, &minimum, &uncertainty);
+            let reason = reason(&active, last, minimum, uncertainty);
             if !self.runs.options.parameters.is_empty() {
                 return Err(Refusal::new(Reason::Missing, parameter.name(), reason).into());
             }
@@ -260,33 +278,57 @@ impl Fitter<'_> {
         Ok(names.iter().map(|parameter| of(&scene, *parameter)).collect())
     }
 
-    fn minimum(&mut self, active: &[Active]) -> Result<(Minimum, Uncertainty), SimulationFailure> {
+    fn minimum(&mut self, active: &[Active]) -> Result<LeastSquares, SimulationFailure> {
         let steps: Vec<_> = active.iter().map(|active| active.scale.steps(active.parameter)).collect();
         let measured = self.runs.measured.clone();
         let lengths: Vec<usize> = self.runs.curves.iter().map(|curve| curve.force_n.len()).collect();
-        let found =
-            minimize(&measured, &steps, &mut |at: &[f64], places: &[Vec<f64>]| self.predict(active, at, places))?;
-        let Some(minimum) = found else {
-            return Err(self.runs.held(
-                "the tissue does not bear these presses where the search begins: a part of its stiffness may follow from something else",
-            ));
+        let largest_n = measured.iter().fold(0.0_f64, |largest, force_n| largest.max(force_n.abs()));
+        let least_noise = RUNS_ERR * largest_n;
+        let mut noise_n = vec![1.0; lengths.len()];
+        let (mut weights_of_samples, mut round, mut from) = (vec![1.0; measured.len()], 0, None);
+        let minimum = loop {
+            let samples = WeightedSamples { measured: &measured, weights: &weights_of_samples };
+            let mut predict = |at: &[f64], places: &[Vec<f64>]| self.predict(active, at, places);
+            let Some(minimum) = minimize(samples, &steps, from.take(), &mut predict)? else {
+                return Err(self.runs.held(
+                    "the tissue does not bear these presses where the search begins: a part of its stiffness may follow from something else",
+                ));
+            };
+            let own_n = noise_of_curves(&differences(&minimum.predicted, &measured), &lengths, least_noise);
+            let Some(own_n) = own_n.filter(|_| round < ROUNDS) else { break minimum };
+            let stays = |(before, now): (&f64, &f64)| (1.0 / STAYS..STAYS).contains(&(now / before));
+            if round > 0 && noise_n.iter().zip(&own_n).all(stays) {
+                break minimum;
+            }
+            weights_of_samples = weights(&own_n, &lengths);
+            (noise_n, from, round) = (own_n, Some(minimum), round + 1);
         };
         let finer = self.runs.finer(&self.scene_at(active, &minimum.x)?)?;
-        let runs_err = finer.map(|finer| differences(&finer, &minimum.predicted));
+        let weighted = |values: &[f64]| -> Vec<f64> {
+            values.iter().zip(&weights_of_samples).map(|(value, weight)| value * weight).collect()
+        };
+        let runs_err = finer.map(|finer| weighted(&differences(&finer, &minimum.predicted)));
         let runs_err: Option<Vec<f64>> = runs_err.map(|err| err.iter().map(|err| FINER * err).collect());
-        let largest_n = measured.iter().fold(0.0_f64, |largest, force_n| largest.max(force_n.abs()));
-        let residuals = differences(&minimum.predicted, &measured);
-        let data = MeasuredSamples { residuals: &residuals, lengths: &lengths, least_noise: RUNS_ERR * largest_n };
-        let uncertainty = Uncertainty::of(&minimum.jacobian, &data, runs_err.as_deref());
-        Ok((minimum, uncertainty))
+        let residuals = weighted(&differences(&minimum.predicted, &measured));
+        let data = MeasuredSamples { residuals: &residuals, lengths: &lengths, least_noise };
+        let mut jacobian = minimum.jacobian.clone();
+        for (mut row, weight) in jacobian.row_iter_mut().zip(&weights_of_samples) {
+            row *= *weight;
+        }
+        let uncertainty = Uncertainty::of(&jacobian, &data, runs_err.as_deref());
+        let ends = lengths.iter().scan(0, |end, length| {
+            *end += length;
+            Some(*end)
+        });
+        let noise_of_curves_n = ends.map(|end| uncertainty.noise / weights_of_samples[end - 1]).collect();
+        Ok(LeastSquares { minimum, uncertainty, noise_of_curves_n })
     }
 
     fn finish(
         self,
         original: &Scene,
         active: &[Active],
-        minimum: &Minimum,
-        uncertainty: Uncertainty,
+        LeastSquares { minimum, uncertainty, noise_of_curves_n }: LeastSquares,
         untold: Vec<UntoldParameter>,
     ) -> Result<Fit, SimulationFailure> {
         let Runs { curves, count, .. } = &self.runs;
@@ -327,7 +369,7 @@ impl Fitter<'_> {
             correlations: uncertainty.correlations,
             residual: Residual::of(curves, &fitted_n),
             fitted_n,
-            noise_n: uncertainty.noise,
+            noise_of_curves_n,
             autocorrelation: uncertainty.autocorrelation,
             runs: *count,
             warnings,

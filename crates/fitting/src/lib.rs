@@ -6,6 +6,7 @@
 
 pub mod curve_file;
 pub mod fit;
+mod noise;
 pub mod options;
 mod parallel;
 pub mod residual;

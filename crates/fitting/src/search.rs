@@ -1,6 +1,6 @@
 //! The search for the least squares (Levenberg–Marquardt), over any function from a few numbers to many.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
@@ -40,16 +40,28 @@ pub(crate) struct Minimum {
     pub(crate) converged: bool,
 }
 
+/// What a function is fitted to: the value of each sample, and its weight.
+#[derive(Clone, Copy)]
+pub(crate) struct WeightedSamples<'m> {
+    pub(crate) measured: &'m [f64],
+    pub(crate) weights: &'m [f64],
+}
+
+/// A place, with the values and the derivatives there.
+type Differentiated = (DVector<f64>, Vec<f64>, DMatrix<f64>);
+
 struct Problem<'p, 'm, E> {
-    measured: &'m [f64],
-    /// The square root of the sum of its squares: residuals are relative to it.
+    samples: WeightedSamples<'m>,
+    /// The square root of the sum of the squares of weighted values: residuals are relative to it.
     norm: f64,
     steps: &'m [[[f64; 2]; 2]],
     x: DVector<f64>,
     predicted: Option<Vec<f64>>,
     predict: RefCell<&'m mut Predict<'p, E>>,
-    /// The last derivatives, and where.
-    newest: RefCell<Option<(DVector<f64>, DMatrix<f64>)>>,
+    /// Where it was differentiated last.
+    newest: RefCell<Option<Differentiated>>,
+    /// Whether no step from there matters ([`NEAR`]).
+    is_near: Cell<bool>,
     failure: RefCell<Option<E>>,
 }
 
@@ -91,7 +103,7 @@ impl<E> Problem<'_, '_, E> {
                 }
             }
         }
-        *self.newest.borrow_mut() = Some((self.x.clone(), jacobian.clone()));
+        *self.newest.borrow_mut() = Some((self.x.clone(), here.clone(), jacobian.clone()));
         Some(jacobian)
     }
 }
@@ -102,12 +114,13 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
     type ParameterStorage = Owned<f64, Dyn>;
 
     fn set_params(&mut self, x: &DVector<f64>) {
-        // The search looks again where it came from.
         if self.predicted.is_some() && self.x == *x {
             return;
         }
         self.x.copy_from(x);
-        self.predicted = self.call(&[x.as_slice().to_vec()]).pop().flatten();
+        // A step that was in vain leads back to where it began.
+        let known = self.newest.borrow().as_ref().filter(|(at, ..)| at == x).map(|(_, predicted, _)| predicted.clone());
+        self.predicted = known.or_else(|| self.call(&[x.as_slice().to_vec()]).pop().flatten());
     }
 
     fn params(&self) -> DVector<f64> {
@@ -119,57 +132,93 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
             return None;
         }
         // A place without a value is worse than any that has one: there forces are at most some thousand times the measured ones.
-        let residual = |index: usize, measured: f64| match &self.predicted {
-            Some(predicted) => (predicted[index] - measured) / self.norm,
+        let WeightedSamples { measured, weights } = self.samples;
+        let residual = |index: usize| match &self.predicted {
+            Some(predicted) => weights[index] * (predicted[index] - measured[index]) / self.norm,
             None => NO_VALUE,
         };
-        let residuals = self.measured.iter().enumerate().map(|(index, measured)| residual(index, *measured));
-        Some(DVector::from_iterator(self.measured.len(), residuals))
+        Some(DVector::from_iterator(measured.len(), (0..measured.len()).map(residual)))
     }
 
     fn jacobian(&self) -> Option<DMatrix<f64>> {
+        let known = self.newest.borrow().as_ref().filter(|(x, ..)| *x == self.x).map(|(.., jacobian)| jacobian.clone());
+        let mut jacobian = known.or_else(|| self.derivatives())?;
         // A number without a derivative stays where it is.
-        let known = |value: f64| if value.is_nan() { 0.0 } else { value / self.norm };
-        self.derivatives().map(|jacobian| jacobian.map(known))
+        jacobian.apply(|value| *value = if value.is_nan() { 0.0 } else { *value / self.norm });
+        for (mut row, weight) in jacobian.row_iter_mut().zip(self.samples.weights) {
+            row *= *weight;
+        }
+        // Runs err by more than what a smaller step would gain: it would be taken again and again.
+        self.is_near.set(promised(&jacobian, &self.residuals()?) <= tolerance(self.samples.measured.len()));
+        if self.is_near.get() { None } else { Some(jacobian) }
     }
 }
 
-/// Searches from 0 on for the numbers with the least sum of squares of `predict` − `measured`, which is not 0 throughout. `steps` are
-/// the two differences, one to each side, by which it differentiates each number, each with what it divides the difference of the function
-/// by. Without numbers it evaluates once. `None` if the function has no value at 0.
+/// Returns the relative change of the sum of squares, of so many samples, below which a step does not matter.
+#[allow(clippy::cast_precision_loss)]
+fn tolerance(samples: usize) -> f64 {
+    NEAR * NEAR / samples.max(1) as f64
+}
+
+/// Returns the part of the sum of squares that the linear problem at a place promises to take away: what the residuals have in common
+/// with the columns of the Jacobian.
+fn promised(jacobian: &DMatrix<f64>, residuals: &DVector<f64>) -> f64 {
+    /// Columns with a smaller part of their own, relative to the largest, are those of others.
+    const OWN: f64 = 1e-9;
+    let decomposed = jacobian.clone().svd(true, false);
+    let largest = decomposed.singular_values.amax();
+    let directions = decomposed.u.iter().flat_map(|u| u.column_iter().zip(&decomposed.singular_values));
+    let along = directions.filter(|(_, value)| **value > OWN * largest).map(|(u, _)| u.dot(residuals).powi(2));
+    along.sum::<f64>() / residuals.norm_squared().max(f64::MIN_POSITIVE)
+}
+
+/// Searches for the numbers with the least sum of squares of weighted differences of `predict` from the measured values, which are not 0
+/// throughout: from 0 on, or from the minimum with other weights. `steps` are the two differences, one to each side, by which it
+/// differentiates each number, each with what it divides the difference of the function by. Without numbers it evaluates once. `None` if
+/// the function has no value at 0.
 ///
 /// # Errors
 /// Returns the error of `predict`.
 pub(crate) fn minimize<E>(
-    measured: &[f64],
+    samples: WeightedSamples<'_>,
     steps: &[[[f64; 2]; 2]],
+    from: Option<Minimum>,
     predict: &mut Predict<'_, E>,
 ) -> Result<Option<Minimum>, E> {
-    let norm = measured.iter().map(|value| value * value).sum::<f64>().sqrt();
+    let WeightedSamples { measured, weights } = samples;
+    let norm = measured.iter().zip(weights).map(|(value, weight)| (value * weight).powi(2)).sum::<f64>().sqrt();
     let mut problem = Problem {
-        measured,
+        samples,
         norm,
         steps,
         x: DVector::zeros(steps.len()),
         predicted: None,
         predict: RefCell::new(predict),
         newest: RefCell::default(),
+        is_near: Cell::new(false),
         failure: RefCell::default(),
     };
-    problem.set_params(&DVector::zeros(steps.len()));
+    match from {
+        Some(Minimum { x, predicted, jacobian, .. }) => {
+            problem.x.copy_from_slice(&x);
+            problem.predicted = Some(predicted.clone());
+            problem.newest = RefCell::new(Some((problem.x.clone(), predicted, jacobian)));
+        }
+        None => problem.set_params(&DVector::zeros(steps.len())),
+    }
     let mut converged = true;
     if !steps.is_empty() && problem.predicted.is_some() {
-        #[allow(clippy::cast_precision_loss)]
-        let ftol = NEAR * NEAR / measured.len() as f64;
+        let ftol = tolerance(measured.len());
         let search = LevenbergMarquardt::new().with_ftol(ftol).with_xtol(XTOL).with_scale_diag(false);
         let (found, report) = search.with_stepbound(STEP_BOUND).with_patience(MAX_EVALUATIONS).minimize(problem);
-        (problem, converged) = (found, report.termination.was_successful());
+        converged = report.termination.was_successful() || found.is_near.get();
+        problem = found;
     }
     if let Some(failure) = problem.failure.take() {
         return Err(failure);
     }
-    let newest = problem.newest.take().filter(|(x, _)| (x - &problem.x).amax() < SAME);
-    let jacobian = newest.map(|(_, jacobian)| jacobian).or_else(|| problem.derivatives());
+    let newest = problem.newest.take().filter(|(x, ..)| (x - &problem.x).amax() < SAME);
+    let jacobian = newest.map(|(.., jacobian)| jacobian).or_else(|| problem.derivatives());
     if let Some(failure) = problem.failure.take() {
         return Err(failure);
     }
@@ -184,6 +233,35 @@ mod tests {
 
     const STEPS: [[f64; 2]; 2] = [[-0.01; 2], [0.01; 2]];
 
+    fn samples(measured: &[f64]) -> WeightedSamples<'_> {
+        WeightedSamples { measured, weights: &[1.0; 40] }
+    }
+
+    /// Two curves of one number that contradict each other: the weights decide, and what is known of the first minimum needs no
+    /// further derivatives.
+    #[test]
+    fn other_weights_move_the_minimum_with_few_evaluations() {
+        let measured: Vec<f64> = (0..40).map(|k| if k < 20 { 1.0 } else { 2.0 }).collect();
+        let mut evaluations = 0;
+        let mut predict = |_: &[f64], places: &[Vec<f64>]| {
+            evaluations += places.len();
+            Ok::<_, ()>(places.iter().map(|x| Some(vec![x[0]; 40])).collect())
+        };
+        let equal = minimize(samples(&measured), &[STEPS], None, &mut predict).unwrap().unwrap();
+        assert!((equal.x[0] - 1.5).abs() < 1e-9, "{:?}", equal.x);
+        let weights: Vec<f64> = (0..40).map(|k| if k < 20 { 3.0 } else { 1.0 }).collect();
+        let first = std::mem::take(&mut evaluations);
+        let mut predict = |_: &[f64], places: &[Vec<f64>]| {
+            evaluations += places.len();
+            Ok::<_, ()>(places.iter().map(|x| Some(vec![x[0]; 40])).collect())
+        };
+        let weighted = WeightedSamples { measured: &measured, weights: &weights };
+        let moved = minimize(weighted, &[STEPS], Some(equal), &mut predict).unwrap().unwrap();
+        // (9·1 + 1·2)/10.
+        assert!((moved.x[0] - 1.1).abs() < 1e-6, "{:?}", moved.x);
+        assert!(evaluations <= first, "{evaluations}");
+    }
+
     #[test]
     fn an_exponential_is_found_from_far_away_and_places_without_a_value_are_left() {
         let times: Vec<f64> = (0..40).map(|k| 0.1 * f64::from(k)).collect();
@@ -193,7 +271,7 @@ mod tests {
             evaluations += places.len();
             Ok::<_, ()>(places.iter().map(|x| (x[0] < 3.0).then(|| curve(x))).collect())
         };
-        let found = minimize(&curve(&[2.5, -0.7]), &[STEPS; 2], &mut predict).unwrap().unwrap();
+        let found = minimize(samples(&curve(&[2.5, -0.7])), &[STEPS; 2], None, &mut predict).unwrap().unwrap();
         assert!(found.converged);
         assert!((found.x[0] - 2.5).abs() < 1e-3 && (found.x[1] + 0.7).abs() < 1e-3, "{:?}", found.x);
         assert!(evaluations < 60, "{evaluations}");
@@ -211,7 +289,7 @@ mod tests {
             Ok::<_, ()>(places.iter().map(value).collect())
         };
         let measured: Vec<f64> = (0..5).map(|k| 2.5 + f64::from(k)).collect();
-        let found = minimize(&measured, &[STEPS; 2], &mut predict).unwrap().unwrap();
+        let found = minimize(samples(&measured), &[STEPS; 2], None, &mut predict).unwrap().unwrap();
         assert!((found.x[0] - 0.5).abs() < 1e-6 && found.x[1] == 0.0, "{:?}", found.x);
         assert!((found.jacobian[(0, 0)] - 1.0).abs() < 1e-9 && found.jacobian[(0, 1)].is_nan(), "{}", found.jacobian);
     }

@@ -25,8 +25,6 @@ pub(super) struct FitReport {
     /// The same divided by the largest force.
     relative_residual: f64,
     r_squared: f64,
-    /// Standard deviation, from the residuals.
-    noise_n: f64,
     /// Between a residual and the next; 0 if it is within what chance makes.
     autocorrelation: f64,
     curves: Vec<ReportedCurve>,
@@ -60,16 +58,19 @@ struct ReportedUntold {
 struct ReportedCurve {
     name: String,
     residual_n: f64,
+    /// Standard deviation, from the residuals.
+    noise_n: f64,
     /// At the times of the curve.
     fitted_n: Vec<f64>,
 }
 
 impl FitReport {
     pub(super) fn new(scene: &str, curves: &[MeasuredCurve], fit: &Fit, wall_s: f64) -> Self {
-        let curve = |((curve, residual_n), fitted_n): ((&MeasuredCurve, &f64), &Vec<f64>)| ReportedCurve {
+        let curve = |(index, curve): (usize, &MeasuredCurve)| ReportedCurve {
             name: curve.name.clone(),
-            residual_n: *residual_n,
-            fitted_n: fitted_n.clone(),
+            residual_n: fit.residual.rms_of_curves_n[index],
+            noise_n: fit.noise_of_curves_n[index],
+            fitted_n: fit.fitted_n[index].clone(),
         };
         FitReport {
             scene: scene.to_owned(),
@@ -99,9 +100,8 @@ impl FitReport {
             residual_n: fit.residual.rms_n,
             relative_residual: fit.residual.relative_rms,
             r_squared: fit.residual.r_squared,
-            noise_n: fit.noise_n,
             autocorrelation: fit.autocorrelation,
-            curves: curves.iter().zip(&fit.residual.rms_of_curves_n).zip(&fit.fitted_n).map(curve).collect(),
+            curves: curves.iter().enumerate().map(curve).collect(),
             runs: fit.runs,
             wall_s,
             warnings: fit.warnings.clone(),
