@@ -195,7 +195,7 @@ export class FileOpener {
     // What is an option on the command line is a field here.
     this.show(`${excerpt(said).replace(/ \(label = N[^)]*\)/, "")}.`);
     const label = element("label", { textContent: "Label " });
-    const chosen = element("input", { type: "number", min: "1", max: "4294967295", step: "1", value: /labels (\d+)/.exec(said)?.[1] ?? "1" });
+    const chosen = element("input", { type: "number", required: true, min: "1", max: "4294967295", step: "1", value: /labels (\d+)/.exec(said)?.[1] ?? "1" });
     label.append(chosen);
     this.units.replaceChildren(label);
     this.units.hidden = false;

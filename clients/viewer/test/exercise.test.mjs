@@ -83,7 +83,7 @@ describe("an exercise", () => {
     assert.deepEqual(await cut(page), []);
     await page.page.click("#finish-exercise");
     await page.until(({ exercise }) => exercise.isDebriefing && exercise.finished);
-    await page.says("debriefing-tables", /Coverage, phase 1/);
+    await page.says("debriefing-tables", /Coverage share, phase 1/);
     await page.says("debriefing-tables", /Search, [01]:\d\d/);
     assert.deepEqual(page.complaints, []);
     await close(page);

@@ -262,7 +262,7 @@ describe("the page", () => {
     const [panel, room] = await page.page.evaluate(
       "[document.querySelector('aside').scrollHeight, document.querySelector('aside').clientHeight]",
     );
-    assert.ok(panel <= room, "scripts and looks are in sight without scrolling");
+    assert.ok(panel <= room, `scripts and looks are in sight without scrolling: ${panel} px in ${room}`);
     const words = await page.page.evaluate("document.body.innerText");
     assert.doesNotMatch(words, /\b(reset|magnitude|z|free to take)\b/i);
     await close(page);
