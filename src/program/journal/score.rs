@@ -7,8 +7,9 @@ use palpate_exercise::Measures;
 use palpate_refusal::printable::printable_json;
 use palpate_session::journal::ReplayEvent;
 use palpate_session::journal::exercise::ExerciseEvents;
+use palpate_tissue::limits::Limits;
 
-use super::super::score::exercise::{ExerciseOptions, feeling, usual_thresholds, warn};
+use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn, with_noticed_press};
 use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
@@ -55,6 +56,8 @@ pub(super) struct MeasuredJournal {
     measures: Measures,
     /// When its recording began, ns after the beginning of 1970.
     began_unix_ns: u64,
+    /// Whether its exercise has ended; also of a session that was made for none.
+    has_ended: bool,
     /// Where it is damaged, and the last whole step.
     pub(super) damage: Option<(String, u64)>,
 }
@@ -77,11 +80,12 @@ pub(super) fn measure(
     // Each step is a row, also where the tissue rests.
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
-    let chosen = feeling(chosen, &model)?;
+    let chosen = with_noticed_press(chosen, &model, &Limits::default())?;
     let options = options.checked(usual_thresholds(chosen.as_ref()))?;
     if let Some(chosen) = &chosen {
         warn(chosen, &model);
     }
+    let has_ended = replay.header().exercise.is_none() || events.result.is_some();
     let mut recorder = ScoreRecorder::new(&model, begin, options, None, (chosen.as_ref(), events))?;
     recorder.see(replay.session());
     let last = replay.survey().until_step;
@@ -112,18 +116,23 @@ pub(super) fn measure(
     };
     recorder.finish(replay.session());
     let (score, measures) = recorder.into_score(of, model.scene.stepping.rate_hz);
-    Ok(MeasuredJournal { score, measures, began_unix_ns, damage })
+    Ok(MeasuredJournal { score, measures, began_unix_ns, has_ended, damage })
 }
 
 /// Measures a journal, and writes the score.
 pub(super) fn score(arguments: &ScoreArguments) -> Result<(), Failure> {
     let ScoreArguments { source, options, exercise, json, output: file, report: page, xapi, quiet } = arguments;
-    let MeasuredJournal { score, measures, began_unix_ns, damage } = measure(source, options, exercise, *quiet)?;
+    if xapi.xapi.is_some() && exercise.recorded(&source.file.display().to_string(), source.open()?.header())?.is_none()
+    {
+        return Err(xapi::needs_exercise().into());
+    }
+    let MeasuredJournal { score, measures, began_unix_ns, has_ended, damage } =
+        measure(source, options, exercise, *quiet)?;
     if let Some(page) = page {
         write_file(page, report::page(&score, &measures)?.as_bytes())?;
     }
     if let Some(file) = &xapi.xapi {
-        let statements = xapi::statements(&score, xapi, began_unix_ns)?;
+        let statements = xapi::statements(&score, xapi, began_unix_ns, has_ended)?;
         write_file(file, (printable_json(format!("{statements:#}")) + "\n").as_bytes())?;
     }
     match file {

@@ -86,24 +86,32 @@ pub(super) struct XapiOptions {
     xapi_base: Option<WebAddress>,
 }
 
-/// Returns the statements of the exercise of a score, a JSON array in the order of their times. Its session began `began_unix_ns` after the
-/// beginning of 1970.
+/// Returns the statements of the exercise of a score, a JSON array in the order of their times. Its recording began `began_unix_ns` after the
+/// beginning of 1970; `has_ended` tells whether the exercise, and so its last phase, has.
 ///
 /// # Errors
 /// Refuses a score without an exercise.
-pub(super) fn statements(score: &Score, options: &XapiOptions, began_unix_ns: u64) -> Result<Value, Refusal> {
+pub(super) fn statements(
+    score: &Score,
+    options: &XapiOptions,
+    began_unix_ns: u64,
+    has_ended: bool,
+) -> Result<Value, Refusal> {
     // The command line asks for both.
     let (Some(actor), Some(base)) = (&options.actor, &options.xapi_base) else { return Ok(Value::Array(Vec::new())) };
-    let Some(exercise) = &score.exercise else {
-        let message = "needs an exercise: give --exercise, or a journal of a session that was made for one";
-        return Err(Refusal::new(Reason::Missing, "--xapi", message));
-    };
+    let exercise = score.exercise.as_ref().ok_or_else(needs_exercise)?;
     let actor = agent(actor, options.actor_name.as_deref());
-    let of = Statements { score, exercise, actor, base: &base.0, began_unix_ns };
+    let of = Statements { score, exercise, actor, base: &base.0, began_unix_ns, has_ended };
     let mut all: Vec<Value> = of.phases().collect();
-    all.push(of.completed());
+    all.push(of.whole());
     all.extend(exercise.score_percent.map(|percent| of.scored(percent)));
     Ok(Value::Array(all))
+}
+
+/// Returns the refusal of statements without an exercise.
+pub(super) fn needs_exercise() -> Refusal {
+    let message = "needs an exercise: give --exercise, or a journal of a session that was made for one";
+    Refusal::new(Reason::Missing, "--xapi", message)
 }
 
 fn agent(actor: &Actor, name: Option<&str>) -> Value {
@@ -125,6 +133,7 @@ struct Statements<'s> {
     actor: Value,
     base: &'s str,
     began_unix_ns: u64,
+    has_ended: bool,
 }
 
 impl Statements<'_> {
@@ -137,14 +146,11 @@ impl Statements<'_> {
         let source = &self.score.source;
         // What tells one attempt from another.
         let session = (source.session_id.as_deref(), self.began_unix_ns, self.score.begin_step);
-        let attempt = format!("{id}\n{verb}\n{end}\n{}\n{session:?}", self.actor);
         let extensions = json!({
-            format!("{}/seed", self.base): self.exercise.seed,
             format!("{}/scene", self.base): source.scene,
             format!("{}/changed-thresholds", self.base): self.exercise.changed_thresholds,
         });
-        json!({
-            "id": uuid(&attempt),
+        let mut statement = json!({
             "actor": self.actor,
             "verb": { "id": format!("http://adlnet.gov/expapi/verbs/{verb}"), "display": { "en": verb } },
             "object": {
@@ -155,7 +161,10 @@ impl Statements<'_> {
             "result": result,
             "context": { "platform": format!("Palpate {}", self.score.version), "extensions": extensions },
             "timestamp": self.timestamp(end),
-        })
+        });
+        // Another content has another ID: a platform refuses two contents with one.
+        statement["id"] = json!(uuid(&format!("{id}\n{session:?}\n{statement}")));
+        statement
     }
 
     /// Returns the time at which `steps` steps were done, UTC (ISO 8601).
@@ -171,19 +180,22 @@ impl Statements<'_> {
         steps as f64 / self.score.rate_hz
     }
 
-    /// Returns the result of a part that took `steps` steps, with its figures of all tools together.
-    fn result(&self, steps: u64, measures: &[ScoredMeasure]) -> Value {
+    /// Returns the verb and the result of a part that took `steps` steps, with its figures of all tools together. A part that has not ended
+    /// was attempted.
+    fn result(&self, has_ended: bool, steps: u64, measures: &[ScoredMeasure]) -> (&'static str, Value) {
         let of_all = measures.iter().filter(|measure| measure.tool.is_none());
         let figure =
             |measure: &ScoredMeasure| (format!("{}/measures/{}", self.base, measure.name), json!(measure.value));
         let extensions: Map<String, Value> = of_all.map(figure).collect();
-        json!({ "completion": true, "duration": format!("PT{:.2}S", self.seconds(steps)), "extensions": extensions })
+        let duration = format!("PT{:.2}S", self.seconds(steps));
+        let result = json!({ "completion": has_ended, "duration": duration, "extensions": extensions });
+        (if has_ended { "completed" } else { "attempted" }, result)
     }
 
-    fn completed(&self) -> Value {
+    fn whole(&self) -> Value {
         let (activity, steps) = (self.activity(), self.score.steps);
-        let result = self.result(steps, &self.score.measures);
-        self.statement("completed", [&activity, &self.exercise.name], steps, result)
+        let (verb, result) = self.result(self.has_ended, steps, &self.score.measures);
+        self.statement(verb, [&activity, &self.exercise.name], steps, result)
     }
 
     /// Returns the statement of the score, whose time is that of the end.
@@ -195,10 +207,11 @@ impl Statements<'_> {
 
     fn phases(&self) -> impl Iterator<Item = Value> {
         self.exercise.phases.iter().zip(1..).map(|(phase, number)| {
+            let has_ended = self.has_ended || number < self.exercise.phases.len();
             let id = format!("{}/phases/{number}", self.activity());
             let end = (phase.begin_step + phase.steps).saturating_sub(self.score.begin_step);
-            let result = self.result(phase.steps, &phase.measures);
-            let mut statement = self.statement("completed", [&id, &phase.title], end, result);
+            let (verb, result) = self.result(has_ended, phase.steps, &phase.measures);
+            let mut statement = self.statement(verb, [&id, &phase.title], end, result);
             statement["context"]["contextActivities"] = json!({ "parent": [{ "id": self.activity() }] });
             statement
         })
@@ -284,7 +297,7 @@ mod tests {
             xapi_base: Some("https://example.org/simulation/".parse().unwrap()),
         };
         // 2026-01-01 00:00:00.
-        let all = statements(score, &options, 1_767_225_600_000_000_000).unwrap();
+        let all = statements(score, &options, 1_767_225_600_000_000_000, true).unwrap();
         all.as_array().unwrap().clone()
     }
 
@@ -488,7 +501,7 @@ mod tests {
             actor_name: None,
             xapi_base: Some("https://example.org".parse().unwrap()),
         };
-        assert_eq!(statements(&without, &options, 0).unwrap_err().field, "--xapi");
+        assert_eq!(statements(&without, &options, 0, true).unwrap_err().field, "--xapi");
     }
 
     #[test]
