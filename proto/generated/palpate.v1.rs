@@ -622,7 +622,7 @@ pub struct FinishExerciseRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
     /// Ends only this phase (from 1), unless it has ended; the last one ends the exercise. Refused: a phase that has not begun
-    /// (OUT_OF_TURN). 0: the whole exercise.
+    /// (OUT_OF_TURN), and one that the exercise lacks (OUT_OF_RANGE). 0: the whole exercise.
     #[prost(uint32, tag = "2")]
     pub phase: u32,
 }

@@ -78,7 +78,7 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
         "{} of weight {weight} in all",
         of(exercise.criteria.len(), "criterion").replace("criterions", "criteria")
     ));
-    let felt = match (exercise.coverage, chosen.felt) {
+    let felt = match (exercise.coverage, chosen.noticed_press) {
         (Some(CoverageTask::Lump(lump)), Some(NoticedPress { pressure_pa, force_n, depth_m })) => format!(
             "coverage      from {pressure_pa:.0} Pa on: a tip of {:.1} mm radius, {:.1} mm deep with {force_n:.2} N, feels a lump {:.1} mm wide, {} \
              times as stiff, {:.1} mm below\n",
@@ -97,7 +97,7 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
     let (model, limits) = exercise::compile(chosen.as_ref(), &arguments.scene)?;
-    let chosen = exercise::feeling(chosen, &model)?;
+    let chosen = exercise::with_noticed_press(chosen, &model, &limits)?;
     if let Some(chosen) = &chosen {
         ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
     }

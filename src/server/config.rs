@@ -181,7 +181,7 @@ impl Config {
             journal_bytes journals_per_caller tools ties queued_commands_per_tool queued_samples queued_records
             queued_bytes sessions points_in_all point_substeps_per_step contact_work streams_per_session frame_vertices texture_side
             probe_points connections connections_per_address streams_per_connection message_bytes
-            connection_window_bytes queued_changes rehearsal_work law_work mesh_work queued_work streams
+            connection_window_bytes queued_changes rehearsal_work law_work mesh_work press_work queued_work streams
             leases
         );
         if let Some((field, _)) = whole.iter().find(|limit| limit.1) {

@@ -5,8 +5,8 @@
 //!
 //! Jobs are limited by counted work, not by time, so that one request has one result on every machine:
 //! `limits.rehearsal_work` (points × substeps of the rehearsals that choose a scene's stepping), `limits.law_work`
-//! (springs × iterations of a force law), `limits.mesh_work` (operations on a mesh, whose triangles may come from a
-//! stranger). A scene that needs more is refused, never stepped less accurately; offline programs allow 32 times as
+//! (springs × iterations of a force law), `limits.press_work` (points × substeps of presses), `limits.mesh_work` (operations on a
+//! mesh, whose triangles may come from a stranger). A scene that needs more is refused, never stepped less accurately; offline programs allow 32 times as
 //! much.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};

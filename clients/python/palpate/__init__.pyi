@@ -512,8 +512,8 @@ class RemoteSession:
         """Watches the measures of the session's exercise from now on, until it ends."""
     def finish_exercise(self) -> dict[str, Any]:
         """Ends the session's exercise, unless it has ended, and returns its result: `figures`, `tools`, `score_percent`, `criteria`, the
-        hidden `lumps`, the `answers`, the `phases` with their figures, `step` and `time_s`. A trainee gets step and time alone if the exercise
-        says so (`is_told`)."""
+        hidden `lumps`, the `answers`, the `phases` (each with `begin_step`, `step`, `time_s`, `figures` and `tools`), `step` and `time_s`. A
+        trainee gets step and time alone if the exercise says so (`is_told`)."""
     def finish_phase(self, phase: int) -> Optional[dict[str, Any]]:
         """Ends a phase of the session's exercise, from 1, unless it has ended, so that the next one begins. Returns None, or with the last
         phase what `finish_exercise` returns."""

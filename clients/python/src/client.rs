@@ -656,8 +656,8 @@ impl RemoteSession {
     }
 
     /// Ends the session's exercise, unless it has ended, and returns its result: `figures`, `tools`, `score_percent`, `criteria`, the
-    /// hidden `lumps`, the `answers`, the `phases` with their figures, `step` and `time_s`. A trainee gets step and time alone if the exercise
-    /// says so (`is_told`).
+    /// hidden `lumps`, the `answers`, the `phases` (each with `begin_step`, `step`, `time_s`, `figures` and `tools`), `step` and `time_s`. A
+    /// trainee gets step and time alone if the exercise says so (`is_told`).
     fn finish_exercise<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {

@@ -90,11 +90,9 @@ impl ExerciseTask {
 
     /// Tells the phase that goes on, if it is another than before.
     fn tell_phase(&self, before: Option<u32>) {
-        self.run
-            .phase()
-            .filter(|phase| before != Some(*phase))
-            .into_iter()
-            .for_each(|phase| self.live.tell_phase(phase));
+        if let Some(phase) = self.run.phase().filter(|phase| before != Some(*phase)) {
+            self.live.tell_phase(phase);
+        }
     }
 
     /// Returns the step that a session at rest must do next, because figures are due after it; `u64::MAX` if there is none.
@@ -130,28 +128,28 @@ impl ExerciseTask {
         reading.post(account, Piece::Work(Box::new(work)));
     }
 
-    /// Ends a phase of the exercise at the session's present step, if it is `phase`, from 1: with the last one the exercise ends. Returns whether
-    /// the next one has begun.
+    /// Ends a phase of the exercise at the session's present step, if it is `phase`, from 1: with the last one the exercise ends. `note` writes
+    /// to the event log that the next one begins, before anybody is told.
     pub(super) fn end_phase(
         &mut self,
         session: &Session,
         phase: u32,
+        note: impl FnOnce(),
         to: (u64, &Arc<Inbox>),
         account: &Account,
         reading: &Reading,
-    ) -> bool {
+    ) {
         if self.is_over.load(Ordering::Acquire) || self.run.ended().is_some() {
-            return false;
+            return;
         }
-        let goes_on = self.run.end_phase(session, phase);
-        if goes_on {
+        if self.run.end_phase(session, phase) {
+            note();
             self.live.tell_phase(phase + 1);
             self.is_overdue = true;
             self.tell(session, to, account, reading);
         } else if self.run.phase() == Some(phase) {
             self.end(session, to, account, reading);
         }
-        goes_on
     }
 
     /// Ends the exercise at the session's present step, unless it has ended, and has its result computed.

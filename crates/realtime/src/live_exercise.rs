@@ -77,8 +77,11 @@ impl LiveExercise {
         // What had ended before the session came here keeps its own beginning.
         let begin_step = ended.as_ref().map_or(begin_step, |ended| ended.begin_step);
         let ended = ended.map(Arc::new);
-        let phase = u32::from(!chosen.exercise.phases.is_empty());
-        let news = watch::Sender::new(ExerciseNews { ended, phase, ..ExerciseNews::default() });
+        let measured = ended.as_ref().map(|ended| Arc::new(ended.figures.clone()));
+        // The phases that had begun are in the result.
+        let begun = measured.as_ref().map_or(1, |measured| measured.phases.len());
+        let phase = begun.min(chosen.exercise.phases.len()) as u32;
+        let news = watch::Sender::new(ExerciseNews { ended, measured, phase, ..ExerciseNews::default() });
         let plain_tissue = watch::Sender::new((begin_step, plain.clone()));
         let plain_laws = LawCache::default();
         LiveExercise { chosen, trainee_id, plain, begin_step, plain_tissue, plain_laws, news }

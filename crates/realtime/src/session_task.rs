@@ -311,12 +311,12 @@ impl SessionTask {
                 }
             }
             Request::FinishPhase(phase) => {
-                let (task, inbox) = (self.exercise.as_mut(), (self.handle.number, &self.handle.inbox));
-                let goes_on = task.is_some_and(|exercise| {
-                    exercise.end_phase(&self.session, phase, inbox, &self.handle.owner, context.reading)
-                });
-                if goes_on {
-                    self.note_input(Input::PhaseEnded(phase));
+                // Taken out: the task writes to the event log.
+                if let Some(mut exercise) = self.exercise.take() {
+                    let (inbox, note) =
+                        ((self.handle.number, &self.handle.inbox), || self.note_input(Input::PhaseEnded(phase)));
+                    exercise.end_phase(&self.session, phase, note, inbox, &self.handle.owner, context.reading);
+                    self.exercise = Some(exercise);
                 }
             }
             Request::ExerciseEnded(ended) => {

@@ -30,8 +30,8 @@ pub struct ChosenExercise {
     /// The lumps that are hidden.
     pub lumps: Vec<Lump>,
     /// The press from which on the lump of its `[coverage]` is felt; `None` if it has none, and before
-    /// [`feeling`](crate::felt_lump::feeling).
-    pub felt: Option<NoticedPress>,
+    /// [`with_noticed_press`](crate::felt_lump::with_noticed_press).
+    pub noticed_press: Option<NoticedPress>,
 }
 
 impl ChosenExercise {
@@ -47,16 +47,16 @@ impl ChosenExercise {
             let message = format!("{seed}: the lumps of this seed have no room in their box; take another seed");
             Refusal::new(Reason::OutOfRange, "seed", message)
         })?;
-        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps, felt: None })
+        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps, noticed_press: None })
     }
 
-    /// Returns the thresholds of the exercise, where it gives any. That of a lump is [`ChosenExercise::felt`].
+    /// Returns the thresholds of the exercise, where it gives any. That of a lump is [`ChosenExercise::noticed_press`].
     pub fn thresholds(&self) -> MeasureOptions {
         let Exercise { limits, coverage, seen_along, .. } = &self.exercise;
         let usual = MeasureOptions::default();
         let coverage_pa = match coverage {
             Some(CoverageTask::Pressure(pressure_pa)) => Some(*pressure_pa),
-            Some(CoverageTask::Lump(_)) => self.felt.map(|felt| felt.pressure_pa),
+            Some(CoverageTask::Lump(_)) => self.noticed_press.map(|press| press.pressure_pa),
             None => None,
         };
         MeasureOptions {

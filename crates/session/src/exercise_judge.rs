@@ -27,10 +27,11 @@ pub struct ExerciseJudge {
     rate_hz: f64,
     begin_step: u64,
     newest: u64,
-    /// The judge's own beginning: severed springs. The others are of the beginning of the exercise: the numbers of threads and clips, that were there at the beginning.
+    /// Number of springs that were severed at the beginning of what is judged: of the exercise, or of a phase.
     severed_before: usize,
-    /// How many of those springs are between points.
+    /// Number of springs between points that were severed at the beginning of the exercise.
     joints_before: usize,
+    /// The threads and clips that were there at the beginning of the exercise.
     ties_before: Vec<usize>,
     /// Whether it judges a phase that is not the first: its beginning is not that of the exercise.
     is_later_phase: bool,

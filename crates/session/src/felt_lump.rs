@@ -14,6 +14,7 @@ use palpate_haptics::TipShape;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::memory;
 use palpate_tissue::scene::exercise::{CoverageTask, FeltLump, Lump};
 
 use super::chosen_exercise::{ChosenExercise, NoticedPress};
@@ -31,26 +32,32 @@ const DEEPEST_RADII: f64 = 1.5;
 /// Number of samples of a press.
 const SAMPLES: u32 = 96;
 
-/// The largest work of a press, in substeps of points: some tens of seconds.
-const MAX_WORK: f64 = 2e10;
-
-/// Returns an exercise with the press from which on the lump of its `[coverage]` is felt in the tissue of a model: at once if it has none.
+/// Returns an exercise with the press from which on the lump of its `[coverage]` is felt in the tissue of a model: at once if it has no such
+/// lump, or knows the press.
 ///
 /// # Errors
 /// Refuses what [`felt_from`] refuses.
-pub fn feeling(chosen: ChosenExercise, model: &Model, limits: &Limits, stop: &AtomicBool) -> Result<ChosenExercise> {
-    let Some(CoverageTask::Lump(lump)) = &chosen.exercise.coverage else { return Ok(chosen) };
+pub fn with_noticed_press(
+    chosen: ChosenExercise,
+    model: &Model,
+    limits: &Limits,
+    stop: &AtomicBool,
+) -> Result<ChosenExercise> {
+    let (Some(CoverageTask::Lump(lump)), None) = (&chosen.exercise.coverage, chosen.noticed_press) else {
+        return Ok(chosen);
+    };
     let place = || Some(format!("exercise {}", chosen.exercise.name));
-    let felt = felt_from(model, lump, limits, stop).map_err(|refusal| Refusal { place: place(), ..refusal })?;
-    Ok(ChosenExercise { felt: Some(felt), ..chosen })
+    let found = memory::attempt("", || felt_from(model, lump, limits, stop));
+    let press = found.map_err(|refusal| Refusal { place: place(), ..refusal })?;
+    Ok(ChosenExercise { noticed_press: Some(press), ..chosen })
 }
 
-/// Presses the tissue of a model, without its inclusions, over a lump and without it, at the place that stands for the tissue. Takes up to some
-/// tens of seconds; the same model gives the same bits.
+/// Presses the tissue of a model, without its inclusions, over a lump and without it, at the place that stands for the tissue. The same model
+/// and limits give the same bits.
 ///
 /// # Errors
-/// Refuses a tissue that can have no such lump, a lump that no press feels, presses that take too much work, and a tissue that fails under
-/// them, with the field `coverage.lump`; and ends with [`Reason::TimedOut`] when `stop` is set.
+/// Refuses a tissue that can have no such lump, a lump that no press feels, presses that take more than `limits.press_work`, and a tissue that
+/// fails under them, with the field `coverage.lump`; and ends with [`Reason::TimedOut`] when `stop` is set.
 pub fn felt_from(model: &Model, lump: &FeltLump, limits: &Limits, stop: &AtomicBool) -> Result<NoticedPress> {
     let refuse = |reason, message: String| Refusal::new(reason, "coverage.lump", message);
     let scene = model.scene.without_inclusions()?;
@@ -60,17 +67,18 @@ pub fn felt_from(model: &Model, lump: &FeltLump, limits: &Limits, stop: &AtomicB
     let centre_m: DVec3 = place_m - (lump.depth_m + lump.radius_m) * outward;
     let hidden = Lump { centre_m, radius_m: lump.radius_m, stiffness_factor: lump.stiffness_factor };
     let with_lump = scene.with_lump(&hidden).map_err(|refusal| refuse(refusal.reason, refusal.message))?;
-    // The same scheme: forces then differ by the lump alone.
-    let lumped = plain.compile_alike(&with_lump, plain.plan.substeps, limits)?;
     let press = press(radius_m, plain.shape().takes_rigid_tips());
-    #[allow(clippy::cast_precision_loss)]
-    let work = press.steps(&plain) as f64 * f64::from(lumped.plan.substeps) * plain.len() as f64;
-    if work > MAX_WORK {
+    let of_step = (plain.swept_points() as u64).saturating_mul(u64::from(plain.plan.substeps));
+    let (work, most) = (press.steps(&plain).saturating_mul(2).saturating_mul(of_step), limits.press_work);
+    if work > most {
         let message = format!(
-            "a press takes {work:.1e} substeps of points, more than {MAX_WORK:.0e}: give `pressure_pa` instead"
+            "takes two presses of {work} points times substeps, above the limit of {most} (limits.press_work): give \
+             `pressure_pa` instead"
         );
         return Err(refuse(Reason::TooLarge, message));
     }
+    // The same scheme: forces then differ by the lump alone.
+    let lumped = plain.compile_alike(&with_lump, plain.plan.substeps, limits)?;
     let forces_n = |model: &Arc<Model>| match press.forces_n(model, limits, stop) {
         Ok(forces_n) => Ok(forces_n),
         Err(SimulationFailure::Refused(refusal)) => Err(refusal),
@@ -105,13 +113,15 @@ fn noticed(depth_m: &[f64], beside_n: &[f64], over_n: &[f64], radius_m: f64) -> 
         let noticed_n = (NOTICED_PART * beside_n[index]).max(MIN_NOTICED_N);
         (over_n[index] - beside_n[index]).abs() - noticed_n
     };
-    let first = (0..depth_m.len()).find(|index| beyond_n(*index) >= 0.0)?;
-    let before = first.saturating_sub(1);
+    // At the first sample the tip only touches.
+    let first = (1..depth_m.len()).find(|index| beyond_n(*index) >= 0.0)?;
+    let before = first - 1;
     // Both are straight between two samples.
-    let part = if first == before { 0.0 } else { beyond_n(before) / (beyond_n(before) - beyond_n(first)) };
+    let part = (beyond_n(before) / (beyond_n(before) - beyond_n(first))).max(0.0);
     let between = |values: &[f64]| values[before] + part * (values[first] - values[before]);
     let (force_n, depth_m) = (between(beside_n), between(depth_m));
-    Some(NoticedPress { pressure_pa: force_n / (std::f64::consts::PI * radius_m * radius_m), force_n, depth_m })
+    let press = NoticedPress { pressure_pa: force_n / (std::f64::consts::PI * radius_m * radius_m), force_n, depth_m };
+    (press.pressure_pa > 0.0).then_some(press)
 }
 
 #[cfg(test)]

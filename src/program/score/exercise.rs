@@ -80,9 +80,13 @@ pub(crate) fn usual_thresholds(chosen: Option<&ChosenExercise>) -> MeasureOption
 /// Returns the exercise with the press from which on the lump of its `[coverage]` is felt in this tissue, if it has one.
 ///
 /// # Errors
-/// Refuses what [`felt_lump::feeling`] refuses.
-pub(crate) fn feeling(chosen: Option<ChosenExercise>, model: &Model) -> Result<Option<ChosenExercise>, Refusal> {
-    chosen.map(|chosen| felt_lump::feeling(chosen, model, &Limits::default(), &NEVER)).transpose()
+/// Refuses what [`felt_lump::with_noticed_press`] refuses.
+pub(crate) fn with_noticed_press(
+    chosen: Option<ChosenExercise>,
+    model: &Model,
+    limits: &Limits,
+) -> Result<Option<ChosenExercise>, Refusal> {
+    chosen.map(|chosen| felt_lump::with_noticed_press(chosen, model, limits, &NEVER)).transpose()
 }
 
 /// Compiles the scene that the arguments name, with the exercise's changes if there is one. Returns it with the limits in force.

@@ -170,12 +170,19 @@ impl ScoredMeasure {
 pub(crate) struct ScoredCrossing {
     pub(crate) tool: u32,
     /// Its key in the `[limits]` of an exercise, which has the unit of `peak`.
+    #[serde(default = "force_limit")]
     pub(crate) limit: String,
     pub(crate) from_step: u64,
     pub(crate) to_step: u64,
     pub(crate) from_s: f64,
     pub(crate) to_s: f64,
+    #[serde(alias = "peak_n")]
     pub(crate) peak: f64,
+}
+
+/// Returns the limit of a crossing in a score from before there were others.
+fn force_limit() -> String {
+    LimitKind::Force.key().to_owned()
 }
 
 impl ScoredCrossing {

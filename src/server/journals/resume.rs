@@ -10,7 +10,6 @@ use super::keeper::FolderContent;
 use palpate_realtime::{Begin, Pacer, SessionExercise};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::felt_lump::feeling;
 use palpate_session::journal::file::JournalFile;
 use palpate_session::journal::{self, JournalReader, Replay, Resumed, Survey, pb};
 use palpate_tissue::limits::Limits;
@@ -152,10 +151,8 @@ fn exercise(
     resumed: &Resumed,
     ended: Option<&pb::ExerciseResult>,
     pacer: &Pacer,
-    limits: &Limits,
 ) -> Result<SessionExercise> {
     let plain = pacer.plain_of(&chosen, &resumed.first, &NEVER)?;
-    let chosen = feeling(chosen, &resumed.first, limits, &NEVER)?;
     let trainee_id = resumed.header.exercise.as_ref().map(|exercise| exercise.trainee_id.clone()).unwrap_or_default();
     let ended = ended.map(|result| journal::exercise::from_result(result, &chosen));
     Ok(SessionExercise { chosen, trainee_id, plain, ended })
@@ -183,7 +180,7 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
         waiting: std::mem::take(&mut resumed.waiting),
         frozen: false,
         recorded: true,
-        exercise: chosen.map(|chosen| exercise(chosen, &resumed, ended.as_ref(), pacer, limits)).transpose()?,
+        exercise: chosen.map(|chosen| exercise(chosen, &resumed, ended.as_ref(), pacer)).transpose()?,
     };
     let owner = pacer.budget.account(&resumed.header.owner);
     let (step, torn_bytes) = (resumed.session.step_count(), resumed.survey.torn_bytes);

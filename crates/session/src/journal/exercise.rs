@@ -5,25 +5,37 @@ use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::journal as pb;
 
 use crate::RecordedMark;
-use crate::chosen_exercise::ChosenExercise;
+use crate::chosen_exercise::{ChosenExercise, NoticedPress};
 use crate::exercise_judge::{EarnedCriterion, ExerciseScore, PhaseFigures};
 use crate::measured_run::{EndedExercise, MomentFigures};
 use crate::phase_run::PhaseEnd;
-use palpate_refusal::{Refusal, Result};
+use palpate_refusal::{Refusal, Result, positive};
 use palpate_tissue::scene::action::PlaceMark;
 
 /// Returns an exercise as the header of a journal has it; `trainee_id` is the ID that opens the session for a trainee.
 pub fn recorded(chosen: &ChosenExercise, trainee_id: &str) -> pb::RecordedExercise {
-    pb::RecordedExercise { text: chosen.text.to_string(), seed: chosen.seed, trainee_id: trainee_id.to_owned() }
+    let press = |&NoticedPress { pressure_pa, force_n, depth_m }| pb::NoticedPress { pressure_pa, force_n, depth_m };
+    pb::RecordedExercise {
+        text: chosen.text.to_string(),
+        seed: chosen.seed,
+        trainee_id: trainee_id.to_owned(),
+        noticed_press: chosen.noticed_press.as_ref().map(press),
+    }
 }
 
 /// Returns the exercise in the header of a journal; `None` if the session was not made for one. `place` names the journal.
 ///
 /// # Errors
-/// Refuses a text or a seed that [`ChosenExercise::new`] refuses.
+/// Refuses a text or a seed that [`ChosenExercise::new`] refuses, and a pressure that is not above 0.
 pub fn from_header(place: &str, header: &pb::Header) -> Result<Option<ChosenExercise>> {
     let read = |recorded: &pb::RecordedExercise| {
-        let read = ChosenExercise::new("exercise", &recorded.text, Some(recorded.seed));
+        let press = |&pb::NoticedPress { pressure_pa, force_n, depth_m }| {
+            positive("noticed_press.pressure_pa", pressure_pa).map(|_| NoticedPress { pressure_pa, force_n, depth_m })
+        };
+        let read = ChosenExercise::new("exercise", &recorded.text, Some(recorded.seed)).and_then(|chosen| {
+            let noticed_press = recorded.noticed_press.as_ref().map(press).transpose()?;
+            Ok(ChosenExercise { noticed_press, ..chosen })
+        });
         read.map_err(|refusal| Refusal { place: Some(place.to_owned()), ..refusal.within("exercise") })
     };
     header.exercise.as_ref().map(read).transpose()
