@@ -210,11 +210,15 @@ export async function bluest(page, png) {
   return (await extremes(page, png)).bluest;
 }
 
-/** `palpate serve` on a free port, or on `listen`. */
+/** A configuration under which a busy machine refuses no session for want of processor time. */
+const BUSY_MACHINE = "tests/common/busy_machine.toml";
+
+/** `palpate serve` on a free port, or on `listen`. A configuration among the options replaces that of tests. */
 export class Server {
   /** @param {string[]} options */
   static async start(options = [], listen = "127.0.0.1:0") {
-    const child = spawn(PROGRAM, ["serve", "--listen", listen, "--log", "warn", ...options], {
+    const config = options.includes("--config") ? [] : ["--config", BUSY_MACHINE];
+    const child = spawn(PROGRAM, ["serve", "--listen", listen, "--log", "warn", ...config, ...options], {
       cwd: ROOT,
       stdio: ["ignore", "pipe", "inherit"],
     });
