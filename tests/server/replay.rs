@@ -144,6 +144,9 @@ fn hammer(url: String) -> Hammer {
                     touch.hear().await.unwrap();
                     counter.fetch_add(1, Ordering::Relaxed);
                 }
+                // Or they would be ever more.
+                let request = pb::DeleteSessionRequest { session_id: session };
+                server.sessions().await.delete_session(request).await.unwrap();
             }
         });
     });
