@@ -227,9 +227,12 @@ async fn a_trainee_gets_no_call_that_shows_the_truth_and_a_trainer_advises() {
     advise("press deeper", None).await.unwrap();
     advise("", Some([0.01, 0.02, 0.04])).await.unwrap();
     let mut heard: Vec<pb::Advice> = Vec::new();
-    while heard.len() < 2 {
-        heard.extend(watched.message().await.unwrap().unwrap().advice);
-    }
+    let both = async {
+        while heard.len() < 2 {
+            heard.extend(watched.message().await.unwrap().unwrap().advice);
+        }
+    };
+    tokio::time::timeout(TEST_TIMEOUT, both).await.expect("advice is not heard");
     assert_eq!((heard[0].text.as_str(), heard[0].place_m, heard[0].number), ("press deeper", None, 1));
     assert_eq!(
         (heard[1].text.as_str(), heard[1].place_m, heard[1].number),

@@ -1,10 +1,11 @@
 //! Scripts through a server: the same bits as offline, whatever else happens, and clear ends when it can't be.
 
-use std::io::BufReader;
+use std::io::{BufReader, Read as _};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use crate::common::server::{
     self, TEST_TIMEOUT, TestServer, TestTouch, client_program, force, open, repository, server_program,
@@ -324,7 +325,7 @@ async fn session_that(server: &TestServer, wanted: impl Fn(&pb::Session) -> bool
             if let Some(session) = listed.into_iter().find(&wanted) {
                 return session;
             }
-            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+            tokio::time::sleep(Duration::from_millis(10)).await;
         }
     });
     waited.await.expect("no session is as it should be")
@@ -359,6 +360,20 @@ async fn time_waits_for_a_replay_that_stands_still() {
     assert_eq!(summary["final_hash"], expected["final_hash"]);
 }
 
+/// Waits until a client is in the middle of a replay: records have come.
+fn until_records(records: &Path, client: &mut Child) {
+    let begun = Instant::now();
+    while std::fs::metadata(records).map_or(0, |meta| meta.len()) < 20_000 {
+        if let Some(status) = client.try_wait().unwrap() {
+            let mut message = String::new();
+            client.stderr.take().unwrap().read_to_string(&mut message).unwrap();
+            panic!("the client has ended ({status}): {message}");
+        }
+        assert!(begun.elapsed() < TEST_TIMEOUT, "no records");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
 #[test]
 fn a_server_that_stops_in_mid_replay_is_told() {
     let mut server = TestServer::start(&[]);
@@ -372,11 +387,7 @@ fn a_server_that_stops_in_mid_replay_is_told() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // In the middle: records have come.
-    while std::fs::metadata(&records).map_or(0, |meta| meta.len()) < 20_000 {
-        assert!(client.try_wait().unwrap().is_none());
-        std::thread::sleep(std::time::Duration::from_millis(20));
-    }
+    until_records(&records, &mut client);
     server.child.kill().unwrap();
     let output = client.wait_with_output().unwrap();
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -392,14 +403,12 @@ fn a_server_that_falls_silent_in_mid_replay_is_told() {
     let script = folder.path().join("long.toml");
     std::fs::write(&script, "duration_s = 600.0\nsample_every_s = 0.001\nsample_points = [[0, 0]]\n").unwrap();
     let records = folder.path().join("records.jsonl");
-    let client = Command::new(client_program())
+    let mut client = Command::new(client_program())
         .args(["replay", script.to_str().unwrap(), "--server", &server.url, "--output", records.to_str().unwrap()])
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    while std::fs::metadata(&records).map_or(0, |meta| meta.len()) < 20_000 {
-        std::thread::sleep(std::time::Duration::from_millis(20));
-    }
+    until_records(&records, &mut client);
     let frozen = Command::new("kill").args(["-STOP", &server.child.id().to_string()]).status().unwrap();
     assert!(frozen.success());
     let output = client.wait_with_output().unwrap();
