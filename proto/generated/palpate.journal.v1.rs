@@ -892,9 +892,9 @@ pub struct RecordedExercise {
     /// The id that opens the session for a trainee.
     #[prost(string, tag = "3")]
     pub trainee_id: ::prost::alloc::string::String,
-    /// The press from which on the lump of its `\[coverage\]` is felt, if it has one.
-    #[prost(message, optional, tag = "4")]
-    pub noticed_press: ::core::option::Option<NoticedPress>,
+    /// The mean pressure under a tip from which on the lump of its `\[coverage\]` is felt, Pa, if it has one.
+    #[prost(double, optional, tag = "4")]
+    pub noticed_pressure_pa: ::core::option::Option<f64>,
 }
 impl ::prost::Name for RecordedExercise {
     const NAME: &'static str = "RecordedExercise";
@@ -904,29 +904,6 @@ impl ::prost::Name for RecordedExercise {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.RecordedExercise".into()
-    }
-}
-/// The press from which on a lump is felt.
-#[derive(Clone, Copy, PartialEq, ::prost::Message)]
-pub struct NoticedPress {
-    /// Mean pressure under the tip beside the lump, Pa.
-    #[prost(double, tag = "1")]
-    pub pressure_pa: f64,
-    /// Force beside the lump, N.
-    #[prost(double, tag = "2")]
-    pub force_n: f64,
-    /// Depth of the tip, m.
-    #[prost(double, tag = "3")]
-    pub depth_m: f64,
-}
-impl ::prost::Name for NoticedPress {
-    const NAME: &'static str = "NoticedPress";
-    const PACKAGE: &'static str = "palpate.journal.v1";
-    fn full_name() -> ::prost::alloc::string::String {
-        "palpate.journal.v1.NoticedPress".into()
-    }
-    fn type_url() -> ::prost::alloc::string::String {
-        "/palpate.journal.v1.NoticedPress".into()
     }
 }
 /// A triangle mesh in full precision.

@@ -1525,8 +1525,8 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(90) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(257) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(260) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(256) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(259) },
 Field { number: 14, is_list: false, kind: FieldKind::Message(233) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 16, is_list: false, kind: FieldKind::Message(255) },
@@ -1535,19 +1535,14 @@ Shape { name: "palpate.journal.v1.RecordedExercise", bytes: size_of::<crate::jou
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
-Field { number: 4, is_list: false, kind: FieldKind::Message(256) },
-] },
-Shape { name: "palpate.journal.v1.NoticedPress", bytes: size_of::<crate::journal::NoticedPress>(), decode: |bytes| <crate::journal::NoticedPress as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
+Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal::TriangleMesh>(), decode: |bytes| <crate::journal::TriangleMesh as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(259) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(258) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(258) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(257) },
 ] },
 Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1593,7 +1588,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(263) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(262) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1609,8 +1604,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(263) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(262) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1621,7 +1616,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1630,20 +1625,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(266) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(268) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(270) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(267) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(269) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(267) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(269) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(271) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(266) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(268) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(270) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1655,20 +1650,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(274) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(272) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(272) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(273) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(271) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(271) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(273) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(272) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(278) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(279) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(277) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(278) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1683,14 +1678,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(264) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(263) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1699,7 +1694,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1709,7 +1704,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1717,7 +1712,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1728,7 +1723,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1736,7 +1731,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use palpate_refusal::printable::printable_lines;
 use palpate_session::check;
-use palpate_session::chosen_exercise::{ChosenExercise, NoticedPress};
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::exercise_judge::ExerciseJudge;
 use palpate_tissue::Model;
 use palpate_tissue::scene::collection::find_script;
@@ -78,12 +78,12 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
         "{} of weight {weight} in all",
         of(exercise.criteria.len(), "criterion").replace("criterions", "criteria")
     ));
-    let felt = match (exercise.coverage, chosen.noticed_press) {
-        (Some(CoverageTask::Lump(lump)), Some(NoticedPress { pressure_pa, force_n, depth_m })) => format!(
-            "coverage      from {pressure_pa:.0} Pa on: a tip of {:.1} mm radius, {:.1} mm deep with {force_n:.2} N, feels a lump {:.1} mm wide, {} \
+    let felt = match (exercise.coverage, chosen.noticed_pressure_pa) {
+        (Some(CoverageTask::Lump(lump)), Some(pressure_pa)) => format!(
+            "coverage      from {pressure_pa:.0} Pa on: a tip of {:.1} mm radius feels with {:.2} N a lump {:.1} mm wide, {} \
              times as stiff, {:.1} mm below\n",
             1e3 * lump.tip_radius_m,
-            1e3 * depth_m,
+            pressure_pa * std::f64::consts::PI * lump.tip_radius_m * lump.tip_radius_m,
             2e3 * lump.radius_m,
             lump.stiffness_factor,
             1e3 * lump.depth_m
@@ -97,7 +97,7 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
     let (model, limits) = exercise::compile(chosen.as_ref(), &arguments.scene)?;
-    let chosen = exercise::with_noticed_press(chosen, &model, &limits)?;
+    let chosen = exercise::with_noticed_pressure(chosen, &model, &limits)?;
     if let Some(chosen) = &chosen {
         ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
     }

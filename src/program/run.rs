@@ -13,7 +13,7 @@ use palpate_tissue::scene::record::{self, StageTime, Summary, TopologyRecord};
 
 use super::indent::{self, IndentArguments};
 use super::scene::SceneArguments;
-use super::score::exercise::{ExerciseOptions, compile, usual_thresholds, with_noticed_press};
+use super::score::exercise::{ExerciseOptions, compile, usual_thresholds, with_noticed_pressure};
 use super::score::{ScoreOptions, ScoreRecorder, ScoreSource};
 use super::{Failure, clock_s, say, with_progress};
 
@@ -62,7 +62,7 @@ pub(crate) struct RunArguments {
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
     let (model, limits) = compile(chosen.as_ref(), &arguments.scene)?;
-    let chosen = with_noticed_press(chosen, &model, &limits)?;
+    let chosen = with_noticed_pressure(chosen, &model, &limits)?;
     let options = arguments.score_options.checked(usual_thresholds(chosen.as_ref()))?;
     if let (None, Some(option)) = (&arguments.score, arguments.score_options.given()) {
         return Err(Failure::Refused(format!("{option}: goes with --score FILE alone")));

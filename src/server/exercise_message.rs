@@ -60,7 +60,7 @@ fn is_live(exercise: &Exercise, name: &str) -> bool {
 pub(super) fn of_session(live: &LiveExercise, is_trainee: bool) -> pb::SessionExercise {
     let role = if is_trainee { pb::ExerciseRole::Trainee } else { pb::ExerciseRole::Trainer };
     let known = exercise(&live.chosen.exercise);
-    let felt_pa = live.chosen.noticed_press.map(|press| press.pressure_pa);
+    let felt_pa = live.chosen.noticed_pressure_pa;
     pb::SessionExercise {
         exercise: Some(pb::Exercise { coverage_pa: known.coverage_pa.or(felt_pa), ..known }),
         role: role.into(),

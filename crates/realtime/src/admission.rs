@@ -24,7 +24,7 @@ use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_session::Session;
 use palpate_session::budget::{Account, Purpose, Resource, Taken};
 use palpate_session::chosen_exercise::ChosenExercise;
-use palpate_session::felt_lump::with_noticed_press;
+use palpate_session::felt_lump::with_noticed_pressure;
 use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::schedule::Schedule;
@@ -168,7 +168,7 @@ impl Pacer {
         let model = self.model_of(scene, stop)?;
         let of_exercise = |chosen: ChosenExercise| {
             let plain = self.plain_of(&chosen, &model, stop)?;
-            let chosen = with_noticed_press(chosen, &model, &self.limits, stop);
+            let chosen = with_noticed_pressure(chosen, &model, &self.limits, stop);
             let chosen = chosen.map_err(|refusal| refusal.within("exercise"))?;
             Ok(SessionExercise { chosen, trainee_id: random_id()?, plain, ended: None })
         };

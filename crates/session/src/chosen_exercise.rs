@@ -7,17 +7,6 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::scene::exercise::{CoverageTask, Exercise, Lump};
 
-/// The press from which on a lump is felt.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct NoticedPress {
-    /// Mean pressure under the tip beside the lump, Pa.
-    pub pressure_pa: f64,
-    /// Force beside the lump, N.
-    pub force_n: f64,
-    /// Depth of the tip, m.
-    pub depth_m: f64,
-}
-
 /// An exercise and its hidden truth.
 #[derive(Debug, Clone)]
 pub struct ChosenExercise {
@@ -29,9 +18,9 @@ pub struct ChosenExercise {
     pub seed: u64,
     /// The lumps that are hidden.
     pub lumps: Vec<Lump>,
-    /// The press from which on the lump of its `[coverage]` is felt; `None` if it has none, and before
-    /// [`with_noticed_press`](crate::felt_lump::with_noticed_press).
-    pub noticed_press: Option<NoticedPress>,
+    /// The mean pressure under a tip from which on the lump of its `[coverage]` is felt, Pa; `None` if it has none, and before
+    /// [`with_noticed_pressure`](crate::felt_lump::with_noticed_pressure).
+    pub noticed_pressure_pa: Option<f64>,
 }
 
 impl ChosenExercise {
@@ -47,16 +36,16 @@ impl ChosenExercise {
             let message = format!("{seed}: the lumps of this seed have no room in their box; take another seed");
             Refusal::new(Reason::OutOfRange, "seed", message)
         })?;
-        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps, noticed_press: None })
+        Ok(ChosenExercise { exercise, text: text.into(), seed, lumps, noticed_pressure_pa: None })
     }
 
-    /// Returns the thresholds of the exercise, where it gives any. That of a lump is [`ChosenExercise::noticed_press`].
+    /// Returns the thresholds of the exercise, where it gives any. That of a lump is [`ChosenExercise::noticed_pressure_pa`].
     pub fn thresholds(&self) -> MeasureOptions {
         let Exercise { limits, coverage, seen_along, .. } = &self.exercise;
         let usual = MeasureOptions::default();
         let coverage_pa = match coverage {
             Some(CoverageTask::Pressure(pressure_pa)) => Some(*pressure_pa),
-            Some(CoverageTask::Lump(_)) => self.noticed_press.map(|press| press.pressure_pa),
+            Some(CoverageTask::Lump(_)) => self.noticed_pressure_pa,
             None => None,
         };
         MeasureOptions {

@@ -17,7 +17,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
 use palpate_tissue::scene::exercise::{CoverageTask, FeltLump, Lump};
 
-use super::chosen_exercise::{ChosenExercise, NoticedPress};
+use super::chosen_exercise::ChosenExercise;
 use super::press::{ImposedPress, on_surface};
 use super::simulation::SimulationFailure;
 
@@ -32,33 +32,34 @@ const DEEPEST_RADII: f64 = 1.5;
 /// Number of samples of a press.
 const SAMPLES: u32 = 96;
 
-/// Returns an exercise with the press from which on the lump of its `[coverage]` is felt in the tissue of a model: at once if it has no such
-/// lump, or knows the press.
+/// Returns an exercise with the pressure from which on the lump of its `[coverage]` is felt in the tissue of a model: at once if it has no
+/// such lump, or knows the pressure.
 ///
 /// # Errors
 /// Refuses what [`felt_from`] refuses.
-pub fn with_noticed_press(
+pub fn with_noticed_pressure(
     chosen: ChosenExercise,
     model: &Model,
     limits: &Limits,
     stop: &AtomicBool,
 ) -> Result<ChosenExercise> {
-    let (Some(CoverageTask::Lump(lump)), None) = (&chosen.exercise.coverage, chosen.noticed_press) else {
+    let (Some(CoverageTask::Lump(lump)), None) = (&chosen.exercise.coverage, chosen.noticed_pressure_pa) else {
         return Ok(chosen);
     };
     let place = || Some(format!("exercise {}", chosen.exercise.name));
     let found = memory::attempt("", || felt_from(model, lump, limits, stop));
-    let press = found.map_err(|refusal| Refusal { place: place(), ..refusal })?;
-    Ok(ChosenExercise { noticed_press: Some(press), ..chosen })
+    let pressure_pa = found.map_err(|refusal| Refusal { place: place(), ..refusal })?;
+    Ok(ChosenExercise { noticed_pressure_pa: Some(pressure_pa), ..chosen })
 }
 
-/// Presses the tissue of a model, without its inclusions, over a lump and without it, at the place that stands for the tissue. The same model
-/// and limits give the same bits.
+/// Presses the tissue of a model, without its inclusions, over a lump and without it, at the place that stands for the tissue. Returns the
+/// mean pressure under the tip, beside the lump, from which on the forces differ by what is noticed, Pa. The same model and limits give the
+/// same bits.
 ///
 /// # Errors
 /// Refuses a tissue that can have no such lump, a lump that no press feels, presses that take more than `limits.press_work`, and a tissue that
 /// fails under them, with the field `coverage.lump`; and ends with [`Reason::TimedOut`] when `stop` is set.
-pub fn felt_from(model: &Model, lump: &FeltLump, limits: &Limits, stop: &AtomicBool) -> Result<NoticedPress> {
+pub fn felt_from(model: &Model, lump: &FeltLump, limits: &Limits, stop: &AtomicBool) -> Result<f64> {
     let refuse = |reason, message: String| Refusal::new(reason, "coverage.lump", message);
     let scene = model.scene.without_inclusions()?;
     let plain = Model::compile_until(&scene, limits, stop)?;
@@ -87,7 +88,8 @@ pub fn felt_from(model: &Model, lump: &FeltLump, limits: &Limits, stop: &AtomicB
         }
     };
     let (beside_n, over_n) = (forces_n(&plain)?, forces_n(&lumped)?);
-    noticed(&press.depth_m, &beside_n, &over_n, radius_m).ok_or_else(|| {
+    let area_m2 = std::f64::consts::PI * radius_m * radius_m;
+    noticed_force_n(&beside_n, &over_n).map(|force_n| force_n / area_m2).ok_or_else(|| {
         let (depth_m, force_n) = (1e3 * DEEPEST_RADII * radius_m, beside_n.last().copied().unwrap_or_default());
         let message = format!("is not felt by a tip that is {depth_m:.1} mm deep in, with {force_n:.2} N");
         refuse(Reason::OutOfRange, message)
@@ -106,22 +108,20 @@ fn press(radius_m: f64, is_rigid: bool) -> ImposedPress {
     }
 }
 
-/// Returns the press from which on the forces of two presses differ by what is noticed; `None` if they never do.
-fn noticed(depth_m: &[f64], beside_n: &[f64], over_n: &[f64], radius_m: f64) -> Option<NoticedPress> {
+/// Returns the force beside the lump from which on the forces of two presses differ by what is noticed, N; `None` if they never do.
+fn noticed_force_n(beside_n: &[f64], over_n: &[f64]) -> Option<f64> {
     // Above 0: it is noticed.
     let beyond_n = |index: usize| {
         let noticed_n = (NOTICED_PART * beside_n[index]).max(MIN_NOTICED_N);
         (over_n[index] - beside_n[index]).abs() - noticed_n
     };
     // At the first sample the tip only touches.
-    let first = (1..depth_m.len()).find(|index| beyond_n(*index) >= 0.0)?;
+    let first = (1..beside_n.len()).find(|index| beyond_n(*index) >= 0.0)?;
     let before = first - 1;
     // Both are straight between two samples.
     let part = (beyond_n(before) / (beyond_n(before) - beyond_n(first))).max(0.0);
-    let between = |values: &[f64]| values[before] + part * (values[first] - values[before]);
-    let (force_n, depth_m) = (between(beside_n), between(depth_m));
-    let press = NoticedPress { pressure_pa: force_n / (std::f64::consts::PI * radius_m * radius_m), force_n, depth_m };
-    (press.pressure_pa > 0.0).then_some(press)
+    let force_n = beside_n[before] + part * (beside_n[first] - beside_n[before]);
+    (force_n > 0.0).then_some(force_n)
 }
 
 #[cfg(test)]
@@ -136,16 +136,14 @@ mod tests {
         let beside_n: Vec<f64> = depth_m.iter().map(|d| 200.0 * d).collect();
         let over_n: Vec<f64> = depth_m.iter().map(|d| 200.0 * d + 1e4 * d * d).collect();
         // 1e4·d² = 0.1·200·d at 2 mm, but 0.04 N are too little: 1e4·d² = 0.05 N at √5 mm.
-        let felt = noticed(&depth_m, &beside_n, &over_n, 0.005).unwrap();
+        let felt_n = noticed_force_n(&beside_n, &over_n).unwrap();
         let expected_m = 1e-3 * 5.0_f64.sqrt();
-        assert!((felt.depth_m / expected_m - 1.0).abs() < 1e-3, "{felt:?}");
-        assert!((felt.force_n / (200.0 * expected_m) - 1.0).abs() < 1e-3, "{felt:?}");
-        assert!((felt.pressure_pa * std::f64::consts::PI * 2.5e-5 - felt.force_n).abs() < 1e-12, "{felt:?}");
-        assert_eq!(noticed(&depth_m, &beside_n, &beside_n, 0.005), None);
+        assert!((felt_n / (200.0 * expected_m) - 1.0).abs() < 1e-3, "{felt_n}");
+        assert_eq!(noticed_force_n(&beside_n, &beside_n), None);
         // A softer lump is felt as well.
         let softer_n: Vec<f64> = beside_n.iter().map(|force_n| 0.8 * force_n).collect();
-        let felt = noticed(&depth_m, &beside_n, &softer_n, 0.005).unwrap();
-        assert!((felt.force_n - 0.25).abs() < 1e-9, "{felt:?}");
+        let felt_n = noticed_force_n(&beside_n, &softer_n).unwrap();
+        assert!((felt_n - 0.25).abs() < 1e-9, "{felt_n}");
     }
 
     #[test]
@@ -162,8 +160,7 @@ mod tests {
         assert_eq!(felt(0.003, 6.0).unwrap(), shallow);
         let deep = felt(0.008, 6.0).unwrap();
         println!("{shallow:?}\n{deep:?}");
-        assert!(shallow.pressure_pa > 0.0 && deep.pressure_pa > 1.2 * shallow.pressure_pa, "{shallow:?} {deep:?}");
-        assert!(deep.depth_m > shallow.depth_m && deep.depth_m < 0.012, "{deep:?}");
+        assert!(shallow > 0.0 && deep > 1.2 * shallow, "{shallow} {deep}");
         let refused = felt(0.003, 1.0).unwrap_err();
         assert!(refused.field == "coverage.lump" && refused.message.starts_with("is not felt"), "{refused}");
         // No cube is there.

@@ -9,7 +9,7 @@ use palpate_session::journal::ReplayEvent;
 use palpate_session::journal::exercise::ExerciseEvents;
 use palpate_tissue::limits::Limits;
 
-use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn, with_noticed_press};
+use super::super::score::exercise::{ExerciseOptions, usual_thresholds, warn, with_noticed_pressure};
 use super::super::score::{Score, ScoreOptions, ScoreRecorder, ScoreSource, report};
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
@@ -80,7 +80,7 @@ pub(super) fn measure(
     // Each step is a row, also where the tissue rests.
     let mut replay = source.replay(None)?.stopping_every(1);
     let (model, begin) = (replay.session().model().clone(), replay.session().step_count());
-    let chosen = with_noticed_press(chosen, &model, &Limits::default())?;
+    let chosen = with_noticed_pressure(chosen, &model, &Limits::default())?;
     let options = options.checked(usual_thresholds(chosen.as_ref()))?;
     if let Some(chosen) = &chosen {
         warn(chosen, &model);

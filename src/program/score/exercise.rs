@@ -77,16 +77,16 @@ pub(crate) fn usual_thresholds(chosen: Option<&ChosenExercise>) -> MeasureOption
     chosen.map_or_else(MeasureOptions::default, ChosenExercise::thresholds)
 }
 
-/// Returns the exercise with the press from which on the lump of its `[coverage]` is felt in this tissue, if it has one.
+/// Returns the exercise with the pressure from which on the lump of its `[coverage]` is felt in this tissue, if it has one.
 ///
 /// # Errors
-/// Refuses what [`felt_lump::with_noticed_press`] refuses.
-pub(crate) fn with_noticed_press(
+/// Refuses what [`felt_lump::with_noticed_pressure`] refuses.
+pub(crate) fn with_noticed_pressure(
     chosen: Option<ChosenExercise>,
     model: &Model,
     limits: &Limits,
 ) -> Result<Option<ChosenExercise>, Refusal> {
-    chosen.map(|chosen| felt_lump::with_noticed_press(chosen, model, limits, &NEVER)).transpose()
+    chosen.map(|chosen| felt_lump::with_noticed_pressure(chosen, model, limits, &NEVER)).transpose()
 }
 
 /// Compiles the scene that the arguments name, with the exercise's changes if there is one. Returns it with the limits in force.

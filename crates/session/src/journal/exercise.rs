@@ -5,7 +5,7 @@ use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::journal as pb;
 
 use crate::RecordedMark;
-use crate::chosen_exercise::{ChosenExercise, NoticedPress};
+use crate::chosen_exercise::ChosenExercise;
 use crate::exercise_judge::{EarnedCriterion, ExerciseScore, PhaseFigures};
 use crate::measured_run::{EndedExercise, MomentFigures};
 use crate::phase_run::PhaseEnd;
@@ -14,12 +14,11 @@ use palpate_tissue::scene::action::PlaceMark;
 
 /// Returns an exercise as the header of a journal has it; `trainee_id` is the ID that opens the session for a trainee.
 pub fn recorded(chosen: &ChosenExercise, trainee_id: &str) -> pb::RecordedExercise {
-    let press = |&NoticedPress { pressure_pa, force_n, depth_m }| pb::NoticedPress { pressure_pa, force_n, depth_m };
     pb::RecordedExercise {
         text: chosen.text.to_string(),
         seed: chosen.seed,
         trainee_id: trainee_id.to_owned(),
-        noticed_press: chosen.noticed_press.as_ref().map(press),
+        noticed_pressure_pa: chosen.noticed_pressure_pa,
     }
 }
 
@@ -29,12 +28,10 @@ pub fn recorded(chosen: &ChosenExercise, trainee_id: &str) -> pb::RecordedExerci
 /// Refuses a text or a seed that [`ChosenExercise::new`] refuses, and a pressure that is not above 0.
 pub fn from_header(place: &str, header: &pb::Header) -> Result<Option<ChosenExercise>> {
     let read = |recorded: &pb::RecordedExercise| {
-        let press = |&pb::NoticedPress { pressure_pa, force_n, depth_m }| {
-            positive("noticed_press.pressure_pa", pressure_pa).map(|_| NoticedPress { pressure_pa, force_n, depth_m })
-        };
+        let pressure = |pressure_pa| positive("noticed_pressure_pa", pressure_pa);
         let read = ChosenExercise::new("exercise", &recorded.text, Some(recorded.seed)).and_then(|chosen| {
-            let noticed_press = recorded.noticed_press.as_ref().map(press).transpose()?;
-            Ok(ChosenExercise { noticed_press, ..chosen })
+            let noticed_pressure_pa = recorded.noticed_pressure_pa.map(pressure).transpose()?;
+            Ok(ChosenExercise { noticed_pressure_pa, ..chosen })
         });
         read.map_err(|refusal| Refusal { place: Some(place.to_owned()), ..refusal.within("exercise") })
     };
