@@ -41,19 +41,28 @@ impl LimitKind {
     /// All kinds, in the order in which they are told.
     pub const ALL: [LimitKind; 3] = [LimitKind::Force, LimitKind::Pressure, LimitKind::Strain];
 
+    /// Returns its key, its name and unit, and its measure.
+    fn entry(self) -> (&'static str, (&'static str, &'static str), &'static MeasureDefinition) {
+        match self {
+            LimitKind::Force => ("force_n", ("force", " N"), &FORCE_ABOVE_LIMIT),
+            LimitKind::Pressure => ("pressure_pa", ("pressure", " Pa"), &PRESSURE_ABOVE_LIMIT),
+            LimitKind::Strain => ("strain", ("strain", ""), &STRAIN_ABOVE_LIMIT),
+        }
+    }
+
     /// Returns its key in the `[limits]` of an exercise, with the unit at the end if it has one.
     pub fn key(self) -> &'static str {
-        ["force_n", "pressure_pa", "strain"][self as usize]
+        self.entry().0
     }
 
     /// Returns its name and its unit for people; a strain has none.
     pub fn name_and_unit(self) -> (&'static str, &'static str) {
-        [("force", " N"), ("pressure", " Pa"), ("strain", "")][self as usize]
+        self.entry().1
     }
 
     /// Returns the measure that has the share of the contact above the limit.
     pub fn share(self) -> &'static MeasureDefinition {
-        [&FORCE_ABOVE_LIMIT, &PRESSURE_ABOVE_LIMIT, &STRAIN_ABOVE_LIMIT][self as usize]
+        self.entry().2
     }
 }
 
@@ -71,7 +80,11 @@ pub struct ToolLimits {
 impl ToolLimits {
     /// Returns the limit of a kind.
     pub fn of(&self, kind: LimitKind) -> Option<f64> {
-        [self.force_n, self.pressure_pa, self.strain][kind as usize]
+        match kind {
+            LimitKind::Force => self.force_n,
+            LimitKind::Pressure => self.pressure_pa,
+            LimitKind::Strain => self.strain,
+        }
     }
 
     /// Returns the limits that there are.

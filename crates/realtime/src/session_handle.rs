@@ -413,13 +413,24 @@ impl SessionHandle {
     /// # Errors
     /// Refuses a session without an exercise ([`Reason::UnknownExercise`]), and one that is deleted or held for good meanwhile.
     pub async fn finish_exercise(&self) -> Result<Arc<EndedExercise>> {
-        let mut news = self.live_exercise()?.news();
-        self.inbox.send(self.number, Request::FinishExercise);
-        let told = news.wait_for(|news| news.ended.is_some() || news.closed.is_some()).await;
+        let news = self.live_exercise()?.news();
+        self.end(Request::FinishExercise, news, |_| false).await?.ok_or_else(deleted)
+    }
+
+    /// Asks for an end of the exercise or of a phase, and waits until the exercise has ended or `is_done`. Returns the result of an exercise
+    /// that has ended.
+    async fn end(
+        &self,
+        request: Request,
+        mut news: watch::Receiver<ExerciseNews>,
+        is_done: impl Fn(&ExerciseNews) -> bool,
+    ) -> Result<Option<Arc<EndedExercise>>> {
+        self.inbox.send(self.number, request);
+        let told = news.wait_for(|news| news.ended.is_some() || news.closed.is_some() || is_done(news)).await;
         let told = told.map_err(|_| deleted())?;
         match (&told.ended, &told.closed) {
-            (Some(ended), _) => Ok(ended.clone()),
-            (None, why) => Err(why.clone().unwrap_or_else(deleted)),
+            (None, Some(why)) => Err(why.clone()),
+            (ended, _) => Ok(ended.clone()),
         }
     }
 
@@ -431,7 +442,7 @@ impl SessionHandle {
     /// that has not begun ([`Reason::OutOfTurn`]).
     pub async fn finish_phase(&self, phase: u32) -> Result<Option<Arc<EndedExercise>>> {
         let live = self.live_exercise()?;
-        let mut news = live.news();
+        let news = live.news();
         let count = live.chosen.exercise.phases.len();
         if phase == 0 || phase as usize > count {
             let message = format!("{phase} is no phase of the exercise, which has {count}");
@@ -442,15 +453,7 @@ impl SessionHandle {
             let message = format!("{phase} has not begun: phase {begun} goes on");
             return Err(Refusal::new(Reason::OutOfTurn, "phase", message));
         }
-        self.inbox.send(self.number, Request::FinishPhase(phase));
-        let is_told = |news: &ExerciseNews| news.ended.is_some() || news.closed.is_some();
-        let told = news.wait_for(|news| is_told(news) || news.phase > phase).await;
-        let told = told.map_err(|_| deleted())?;
-        match (&told.ended, &told.closed) {
-            (Some(ended), _) => Ok(Some(ended.clone())),
-            (None, Some(why)) => Err(why.clone()),
-            (None, None) => Ok(None),
-        }
+        self.end(Request::FinishPhase(phase), news, |news| news.phase > phase).await
     }
 
     /// Returns the exercise that the session is made for.
