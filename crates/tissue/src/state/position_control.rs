@@ -139,7 +139,7 @@ impl Tool {
         let (unit_j, layout) = (plan.unit_of_work_j(model), &tables.layout);
         let (place_m, was_pressing) = (self.place_m(fraction), rigid.is_pressing());
         if was_pressing {
-            tiles.wake_under(rigid.points());
+            tiles.wake_under(rigid.wakes());
         } else {
             self.seek(model, layout, state, place_m, plan.is_first(fraction));
         }
@@ -161,7 +161,7 @@ impl Tool {
         let pressed = rigid.press(model, plan, layout, state, [place_m, self.own_movement_m(model, plan)]);
         rigid.kick(model, plan, layout, state);
         if was_pressing || pressed.contact_state.is_some() {
-            tiles.wake_under(rigid.points());
+            tiles.wake_under(rigid.wakes());
             rigid.moved(model, plan, far).for_each(|point| tiles.wake_around(point, plan.scheme.sweeps()));
         }
         // Forces of other tools on these points also do work along this movement.

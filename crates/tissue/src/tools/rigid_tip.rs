@@ -34,7 +34,7 @@
 //! A tool that is placed within the tissue, or that jumps into it, comes in along its axis at a bounded speed
 //! ([`MAX_DEEPENING`]). The work of a tool is F·ẋ with x the place that it has then.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -44,6 +44,7 @@ use crate::body::footprint::Footprint;
 use crate::body::model::{Model, Plan, displacement_m};
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
+use crate::kernel::region::TILE;
 use crate::saved::{Checks, SavedPlace, SavedPressing, ensure, unsound};
 use crate::scene::Body;
 use crate::shape::{CellPlace, PointId};
@@ -107,11 +108,18 @@ struct ContactSample {
     /// Its points in [`RigidTip::nodes`], with their weights.
     nodes: [u32; 8],
     weights: [f64; 8],
+    /// w/mass of each, 0 if the point is fixed.
+    moves: [f64; 8],
     /// Σ w²/mass over its movable points.
     relative_inverse_mass: f64,
 }
 
 impl ContactSample {
+    /// Returns whether the tip feels it.
+    fn yields(&self) -> bool {
+        self.relative_inverse_mass > FIXED_PART
+    }
+
     /// Returns the weighted sum of what its points have.
     fn mean(&self, of: impl Fn(usize) -> DVec3) -> DVec3 {
         let mut sum = DVec3::ZERO;
@@ -177,6 +185,11 @@ pub(crate) struct RigidTip {
     tip: Tip,
     samples: Arc<[ContactSample]>,
     nodes: Arc<[TouchedPoint]>,
+    /// A point of each tile that has any of these.
+    wakes: Arc<[[usize; 2]]>,
+    /// The samples that may have a force: those that the tip covers, and those that have one; and their points. Ascending.
+    under: Vec<u32>,
+    under_nodes: Vec<u32>,
     around: Option<SamplesPlace>,
     /// s·A of each sample where the tip is, N/m, and the rest position of that place, m, with the modulus of the tissue, Pa;
     /// `None` after samples were taken.
@@ -206,6 +219,9 @@ impl RigidTip {
             tip,
             samples: Arc::default(),
             nodes: Arc::default(),
+            wakes: Arc::default(),
+            under: Vec::new(),
+            under_nodes: Vec::new(),
             around: None,
             stiffness_n_per_m: Vec::new(),
             covers: None,
@@ -288,6 +304,16 @@ impl RigidTip {
         self.nodes.iter().map(|node| node.point)
     }
 
+    /// Returns a point of each tile that has one of these.
+    pub(crate) fn wakes(&self) -> impl Iterator<Item = [usize; 2]> {
+        self.wakes.iter().copied()
+    }
+
+    /// Returns the points that the tip moves, with their numbers.
+    fn moved_nodes(&self) -> impl Iterator<Item = (usize, &TouchedPoint)> {
+        self.under_nodes.iter().map(|node| (*node as usize, &self.nodes[*node as usize]))
+    }
+
     /// Returns the continuing force on a point, N.
     pub(crate) fn steady_on(&self, place: usize) -> DVec3 {
         let found = self.nodes.binary_search_by_key(&place, |node| node.place);
@@ -296,33 +322,33 @@ impl RigidTip {
 
     /// Lets the force of the last substep act during this one.
     pub(crate) fn go_on<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &mut State<T>) {
-        let forces = self.nodes.iter().zip(&self.steady_n).map(|(node, force_n)| (node, node.inverse_mass * *force_n));
+        let forces = self.moved_nodes().map(|(number, node)| (node, node.inverse_mass * self.steady_n[number]));
         push(forces, plan.force_scale(&model.scene), plan.scheme.constant(), layout, state);
     }
 
     /// Applies the impulses that [`RigidTip::press`] found.
     pub(crate) fn kick<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &mut State<T>) {
-        let changes = self.nodes.iter().zip(self.change_n.iter().copied());
+        let changes = self.moved_nodes().map(|(number, node)| (node, self.change_n[number]));
         push(changes, plan.force_scale(&model.scene), plan.scheme.kick(), layout, state);
     }
 
     /// Returns the points that impulses and steady forces move by more than `far` spacings.
     pub(crate) fn moved(&self, model: &Model, plan: &Plan, far: f64) -> impl Iterator<Item = [usize; 2]> {
         let (scale, kick, constant) = (plan.force_scale(&model.scene), plan.scheme.kick(), plan.scheme.constant());
-        let all = self.nodes.iter().zip(&self.change_n).zip(&self.steady_n);
+        let all = self.moved_nodes().map(|(number, node)| (node, self.change_n[number], self.steady_n[number]));
         let moves = move |c: usize, node: &TouchedPoint, change_n: DVec3, steady_n: DVec3| {
             scale * (kick[c] * change_n + constant[c] * node.inverse_mass * steady_n).abs().max_element()
         };
-        all.filter(move |((node, change_n), steady_n)| {
-            moves(0, node, **change_n, **steady_n).max(moves(1, node, **change_n, **steady_n)) > far
+        all.filter(move |(node, change_n, steady_n)| {
+            moves(0, node, *change_n, *steady_n).max(moves(1, node, *change_n, *steady_n)) > far
         })
-        .map(|((node, _), _)| node.point)
+        .map(|(node, ..)| node.point)
     }
 
     /// Returns the points that an impulse moves, with that movement in spacings.
     pub(crate) fn movements(&self, model: &Model, plan: &Plan) -> impl Iterator<Item = ([usize; 2], DVec3)> {
         let of = plan.force_scale(&model.scene) * plan.scheme.kick()[0];
-        self.nodes.iter().zip(&self.change_n).map(move |(node, change_n)| (node.point, of * *change_n))
+        self.moved_nodes().map(move |(number, node)| (node.point, of * self.change_n[number]))
     }
 
     /// Takes samples around a disc's place, if those that it has are of another part of the surface.
@@ -369,6 +395,7 @@ impl RigidTip {
                 relative_stiffness_m: relative_contact_per_m(model, &sample.cell) * sample.area_m2,
                 nodes: numbers,
                 weights,
+                moves: std::array::from_fn(|k| weights[k] * nodes[numbers[k] as usize].inverse_mass),
                 relative_inverse_mass: parts.sum(),
             }
         };
@@ -393,17 +420,43 @@ impl RigidTip {
             outward: footprint.at_rest().1,
         });
         self.covers = None;
+        let mut tiles = BTreeSet::new();
+        let is_first = |point: &[usize; 2]| tiles.insert(point.map(|at| at / TILE));
+        self.wakes = nodes.iter().map(|node| node.point).filter(is_first).collect();
+        for of_nodes in [&mut self.steady_n, &mut self.change_n, &mut self.displacements_m, &mut self.movements] {
+            of_nodes.clear();
+            of_nodes.resize(nodes.len(), DVec3::ZERO);
+        }
         (self.samples, self.nodes, self.forces_n, self.stiffness_n_per_m) =
             (samples, nodes, forces_n, stiffness_n_per_m);
+        self.list_under();
         self.spread();
+    }
+
+    /// Lists the samples that may have a force: around a disc, most can't.
+    #[allow(clippy::cast_possible_truncation)]
+    fn list_under(&mut self) {
+        let RigidTip { samples, forces_n, stiffness_n_per_m, .. } = self;
+        let may_press = |number: &usize| {
+            let is_covered = stiffness_n_per_m[*number] > 0.0 && samples[*number].yields();
+            is_covered || forces_n[*number] != DVec3::ZERO
+        };
+        self.under = (0..samples.len()).filter(may_press).map(|number| number as u32).collect();
+        self.under_nodes = self.under.iter().flat_map(|number| samples[*number as usize].nodes).collect();
+        self.under_nodes.sort_unstable();
+        self.under_nodes.dedup();
     }
 
     /// Spreads the forces on samples over the points.
     fn spread(&mut self) {
-        self.steady_n.clear();
-        self.steady_n.resize(self.nodes.len(), DVec3::ZERO);
-        for (sample, force_n) in self.samples.iter().zip(&self.forces_n).filter(|(_, force_n)| **force_n != DVec3::ZERO)
-        {
+        for node in &self.under_nodes {
+            self.steady_n[*node as usize] = DVec3::ZERO;
+        }
+        for number in &self.under {
+            let (sample, force_n) = (&self.samples[*number as usize], &self.forces_n[*number as usize]);
+            if *force_n == DVec3::ZERO {
+                continue;
+            }
             for (node, weight) in sample.nodes.iter().zip(sample.weights) {
                 self.steady_n[*node as usize] += weight * *force_n;
             }
@@ -441,6 +494,7 @@ impl RigidTip {
                 gained_j += 0.5 * (now - before) * (self.forces_n[number].length() / before).powi(2);
             }
         }
+        self.list_under();
         gained_j
     }
 
@@ -558,17 +612,24 @@ impl RigidTip {
         let Tip { shape, radius_m, .. } = self.tip;
         let RigidTip { samples, nodes, axis, .. } = self;
         let (axis, to_core_m) = (*axis, to_core_m(&self.tip));
-        self.displacements_m.clear();
-        self.displacements_m.extend(nodes.iter().map(|node| displacement_m(model, layout, state, node.point)));
-        self.movements.clear();
-        self.movements.extend(nodes.iter().map(|node| {
-            let [i, j] = node.point;
-            let component = |c: usize| state.d[c * layout.plane + i * layout.stride + j].wide();
-            DVec3::new(component(0), component(1), component(2))
-        }));
+        for node in self.under_nodes.iter().map(|node| *node as usize) {
+            let point = nodes[node].point;
+            self.displacements_m[node] = displacement_m(model, layout, state, point);
+            let component = |c: usize| state.d[c * layout.plane + point[0] * layout.stride + point[1]].wide();
+            self.movements[node] = DVec3::new(component(0), component(1), component(2));
+        }
         self.touched.clear();
-        for (number, sample) in samples.iter().enumerate() {
+        for number in self.under.iter().map(|number| *number as usize) {
+            let sample = &samples[number];
             let force_n = self.forces_n[number];
+            let counted_n_per_m = |way: DVec3| {
+                let facing = ((-way.dot(sample.outward) - FACING) / (FACING_WHOLLY - FACING)).clamp(0.0, 1.0);
+                if sample.yields() { facing * self.stiffness_n_per_m[number] } else { 0.0 }
+            };
+            // Where a sample is that faces away from a disc does not matter.
+            if shape != TipShape::Sphere && force_n == DVec3::ZERO && counted_n_per_m(-axis) == 0.0 {
+                continue;
+            }
             let moved_m = sample.mean(|node| self.displacements_m[node]);
             let from_m = sample.rest_m + moved_m - place_m;
             let is_within = match shape {
@@ -582,9 +643,7 @@ impl RigidTip {
                 TipShape::Sphere => (from_m.try_normalize().unwrap_or(-axis), radius_m - from_m.length()),
                 TipShape::RigidDisc | TipShape::Disc | TipShape::Blade => (-axis, from_m.dot(axis)),
             };
-            let facing = ((-way.dot(sample.outward) - FACING) / (FACING_WHOLLY - FACING)).clamp(0.0, 1.0);
-            let yields = sample.relative_inverse_mass > FIXED_PART;
-            let counted_n_per_m = if yields { facing * self.stiffness_n_per_m[number] } else { 0.0 };
+            let counted_n_per_m = counted_n_per_m(way);
             let touches = counted_n_per_m > 0.0 && deep_m > 0.0 && deep_m < 2.0 * radius_m;
             if !touches && force_n == DVec3::ZERO {
                 continue;
@@ -614,11 +673,12 @@ impl RigidTip {
     /// Solves for the forces at the end of the substep, by sweeps over the samples. Returns whether friction holds less than half
     /// of the pressure.
     fn solve(&mut self, model: &Model, plan: &Plan) -> bool {
-        let RigidTip { samples, nodes, touched, forces_n, change_n, .. } = self;
+        let RigidTip { samples, under_nodes, touched, forces_n, change_n, .. } = self;
         let [of_u, of_d] = plan.scheme.kick().map(|of| of * plan.force_scale(&model.scene) * model.unit_m);
         let friction = self.tip.friction;
-        change_n.clear();
-        change_n.resize(nodes.len(), DVec3::ZERO);
+        for node in under_nodes.iter() {
+            change_n[*node as usize] = DVec3::ZERO;
+        }
         let (mut held_n, mut sliding_n) = (0.0, 0.0);
         for _ in 0..SWEEPS {
             (held_n, sliding_n) = (0.0, 0.0);
@@ -653,7 +713,7 @@ impl RigidTip {
                 most_by_n2 = most_by_n2.max(by_n.length_squared());
                 for k in 0..sample.nodes.len() {
                     let node = sample.nodes[k] as usize;
-                    change_n[node] += sample.weights[k] * nodes[node].inverse_mass * by_n;
+                    change_n[node] += sample.moves[k] * by_n;
                 }
             }
             if most_by_n2 <= SETTLED * SETTLED * most_n2 {
