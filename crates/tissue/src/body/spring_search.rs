@@ -2,6 +2,7 @@
 #![allow(unsafe_code)]
 
 use std::cell::RefCell;
+use std::ops::Range;
 
 use glam::DVec3;
 
@@ -11,6 +12,9 @@ use crate::kernel::field::{Layout, State};
 use crate::kernel::lanes::{self, Run, Vector};
 use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, TILE, sides_of};
+
+/// The part of a gap that a displacement must be to close it: rounding closes none unseen.
+const NEARLY: f64 = 1.0 - 1e-5;
 
 /// The boxes around the tiles of a tissue at rest, and the length of its longest spring: what a search for springs begins with.
 #[derive(Debug)]
@@ -98,25 +102,58 @@ impl<T: Real> Run<T> for Near<'_, T> {
                 }
                 continue;
             }
-            // First along the axes along which the boxes are apart at rest: most tiles are far.
+            let sides = sides_of(layout, tile);
             let mut touches = true;
-            for apart in [true, false] {
-                for c in 0..3 {
-                    if !touches || (below | above).test(c) != apart {
-                        continue;
-                    }
-                    // No closure: it would not get the instructions of its caller.
+            // No closures: they would not get the instructions of their caller.
+            // Most tiles are far, along an axis along which the boxes are apart at rest.
+            for c in 0..3 {
+                if touches && (below | above).test(c) {
+                    let gap_m = if below.test(c) { least_m[c] - high_m[c] } else { most_m[c] - low_m[c] };
+                    let gap = NEARLY * gap_m / unit_m;
                     // SAFETY: the caller's promise.
-                    let [least, most] = unsafe { range::<V>(layout, &u[c * layout.plane..], tile) };
-                    (displaced[0][c], displaced[1][c]) = (least.wide(), most.wide());
-                    touches = high_m[c] + unit_m * displaced[1][c] >= least_m[c]
-                        && low_m[c] + unit_m * displaced[0][c] <= most_m[c];
+                    touches = unsafe { any_beyond::<V>(layout, &u[c * layout.plane..], &sides, gap) };
                 }
+            }
+            for c in 0..3 {
+                if !touches {
+                    break;
+                }
+                // SAFETY: the caller's promise.
+                let [least, most] = unsafe { range::<V>(layout, &u[c * layout.plane..], &sides) };
+                (displaced[0][c], displaced[1][c]) = (least.wide(), most.wide());
+                touches = high_m[c] + unit_m * displaced[1][c] >= least_m[c]
+                    && low_m[c] + unit_m * displaced[0][c] <= most_m[c];
             }
             if touches {
                 near.push(NearTile { tile, displaced });
             }
         }
+    }
+}
+
+/// Returns whether a value in a tile of a plane is beyond a number, away from 0. Padding counts as in [`range`].
+///
+/// # Safety
+/// As that of [`range`].
+#[inline(always)]
+unsafe fn any_beyond<V: Vector>(
+    layout: &Layout,
+    plane: &[V::Real],
+    [rows, columns]: &[Range<usize>; 2],
+    number: f64,
+) -> bool {
+    let is_above = number > 0.0;
+    // SAFETY: the caller's promise; a row has the padding of a whole tile.
+    unsafe {
+        let (bound, mut farthest) = (V::of(V::Real::of(number)), V::of(V::Real::default()));
+        for i in rows.clone() {
+            let row = plane.as_ptr().add(i * layout.stride + columns.start);
+            for part in 0..TILE / V::LANES {
+                let values = V::load(row.add(part * V::LANES));
+                farthest = if is_above { values.larger(farthest) } else { values.smaller(farthest) };
+            }
+        }
+        V::any(if is_above { farthest.above(bound) } else { bound.above(farthest) })
     }
 }
 
@@ -126,13 +163,13 @@ impl<T: Real> Run<T> for Near<'_, T> {
 /// # Safety
 /// The processor has the instructions, and the tile is one of the layout, which the plane has.
 #[inline(always)]
-unsafe fn range<V: Vector>(layout: &Layout, plane: &[V::Real], tile: usize) -> [V::Real; 2] {
-    let ([rows, columns], zero) = (sides_of(layout, tile), V::Real::default());
+unsafe fn range<V: Vector>(layout: &Layout, plane: &[V::Real], [rows, columns]: &[Range<usize>; 2]) -> [V::Real; 2] {
+    let zero = V::Real::default();
     let mut ends = [[zero; TILE]; 2];
     // SAFETY: the caller's promise; a row has the padding of a whole tile.
     unsafe {
         let (mut least, mut most) = (V::of(zero), V::of(zero));
-        for i in rows {
+        for i in rows.clone() {
             let row = plane.as_ptr().add(i * layout.stride + columns.start);
             for part in 0..TILE / V::LANES {
                 let values = V::load(row.add(part * V::LANES));

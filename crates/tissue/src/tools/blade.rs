@@ -25,6 +25,9 @@ const MIN_SLOPE: f64 = 0.1;
 const NEAR: f64 = 0.1;
 const MAX_SEEKS: usize = 8;
 
+/// The disc of a blade without a force stays until the place that the edge pierces is so many of the disc's radii away.
+const FOLLOWS: f64 = 1.0;
+
 impl Tool {
     /// Returns how the tool is coupled to the tissue.
     pub(crate) fn coupling(&self) -> Coupling {
@@ -52,11 +55,14 @@ impl Tool {
             if is_felt {
                 self.seek_pierced(model, layout, state, [place_m, edge_m]);
             } else {
-                // The place only follows the edge: a move in each step is enough.
+                // Nothing depends on where exactly it is: it follows the edge once that is away.
                 let displacement_m = |point| displacement_m(model, layout, state, point);
                 let sought_m = place_m + self.pierced_m.clamp(0.0, length_m) * edge;
-                self.footprint.leap(model, sought_m, displacement_m);
-                self.footprint.approach(model, sought_m, displacement_m);
+                let away_m = sought_m.distance(self.footprint.surface(displacement_m).0);
+                if away_m > FOLLOWS * self.footprint.radius_m() {
+                    self.footprint.leap(model, sought_m, displacement_m);
+                    self.footprint.approach(model, sought_m, displacement_m);
+                }
             }
         }
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));

@@ -140,7 +140,7 @@ impl TissueDisc for MeshDisc {
 
     fn leap(&mut self, place_m: DVec3, displacement_m: &dyn Fn(PointId) -> DVec3) -> bool {
         let surface = self.shape.surface();
-        let Some(other) = surface.nearest(place_m) else { return false };
+        let Some(other) = surface.nearest_from(place_m, &self.place) else { return false };
         let away_m = |place: &Place| {
             let vertices = surface.triangle(place).map(|vertex| PointId::new(vertex as usize));
             let moved_m: DVec3 =
