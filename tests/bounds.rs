@@ -5,15 +5,13 @@
 //! `PALPATE_STRESS_BOUNDS_FROM` on, and prints which took longer than a second.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/closed_mesh.rs"]
-mod closed_mesh;
-
 use std::fmt::Write;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use closed_mesh::closed_mesh;
+use crate::common::closed_mesh;
+use crate::common::closed_mesh::closed_mesh;
 use fastrand::Rng;
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};

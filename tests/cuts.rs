@@ -6,14 +6,11 @@
 //! `PALPATE_STRESS_CUTS_FROM` on, and tells how far it is.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-#[path = "common/cases.rs"]
-mod cases;
-mod common;
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use common::{model, scene_with};
+use crate::common::cases;
+use crate::common::{model, scene_with};
 use glam::{DQuat, DVec3};
 use palpate_haptics::{Tip, TipShape};
 use palpate_tissue::limits::Limits;

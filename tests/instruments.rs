@@ -1,11 +1,10 @@
 //! Instruments: what their tips do is what tools with these tips do, and what is felt is the sum.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs)]
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 
+use crate::common;
 use glam::{DQuat, DVec3};
 use palpate_session::run::{self, RunEvent, RunOptions};
 use palpate_tissue::Model;

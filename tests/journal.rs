@@ -1,17 +1,13 @@
 //! Journals: what is written is read again, whatever happens to the file, and gives the same bits.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
-#[path = "common/cases.rs"]
-mod cases;
-#[path = "common/journal_opening.rs"]
-mod journal_opening;
-
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use crate::common::cases;
+use crate::common::journal_opening::opening;
 use glam::DVec3;
-use journal_opening::opening;
 use palpate_haptics::{Instrument, Tip};
 use palpate_refusal::Reason;
 use palpate_session::Session;

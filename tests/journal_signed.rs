@@ -2,13 +2,10 @@
 //! changed a file is found.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
-#[path = "common/journal_opening.rs"]
-mod journal_opening;
-
 use std::path::Path;
 use std::process::Command;
 
-use journal_opening::opening;
+use crate::common::journal_opening::opening;
 use palpate::server::journal_key;
 use palpate_session::Session;
 use palpate_session::journal::signature::{Key, Signatures};

@@ -6,12 +6,10 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 #![allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 
-#[path = "common/cases.rs"]
-mod cases;
-
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::common::cases;
 use palpate_realtime::Pacer;
 use palpate_refusal::Reason;
 use palpate_session::budget::Budget;

@@ -1,8 +1,6 @@
 //! Tissue on meshes: the same laws as on the sheet, and the sheet itself where a mesh has its points and springs.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 

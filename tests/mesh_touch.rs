@@ -1,8 +1,6 @@
 //! Tools with a tip on meshes: the same force wherever the disc lies between the vertices, on whichever side it is.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-
 use std::sync::Arc;
 
 use glam::DVec3;

@@ -5,15 +5,12 @@
 //! The descriptors of the protocol list the numbers, so a new field is tried as soon as it exists.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-mod common;
-#[path = "common/journal_opening.rs"]
-mod journal_opening;
-
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::sync::Arc;
 
-use common::scene_with;
+use crate::common::journal_opening;
+use crate::common::scene_with;
 use glam::DVec3;
 use palpate_geometry::{Group, TriangleMesh};
 use palpate_haptics::Tip;

@@ -1,14 +1,11 @@
 //! Names and messages of others in what `palpate` prints: they act on no terminal and begin no line.
 #![allow(clippy::unwrap_used)]
 
-#[path = "common/journal_opening.rs"]
-mod journal_opening;
-
 use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 
-use journal_opening::opening;
+use crate::common::journal_opening::opening;
 use palpate_session::input::Input;
 use palpate_session::journal::{JournalWriter, Opening, pb};
 use palpate_tissue::Model;

@@ -2,13 +2,10 @@
 //! input changes nothing.
 #![allow(clippy::unwrap_used)]
 
-#[path = "common/cases.rs"]
-mod cases;
-mod common;
-
 use std::path::Path;
 
-use common::{SMALL, model, scene};
+use crate::common::cases;
+use crate::common::{SMALL, model, scene};
 use glam::DVec3;
 use palpate_session::Session;
 use palpate_session::command::Command;

@@ -2,9 +2,7 @@
 //! for each time displacements, velocities, forces and energies.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-
-use common::{playing, script};
+use crate::common::{playing, script};
 use glam::DVec3;
 use palpate_session::Session;
 use palpate_tissue::limits::Limits;

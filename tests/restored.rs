@@ -4,17 +4,13 @@
 //! Some 200 snapshots in every run of the tests; `PALPATE_SNAPSHOTS=5000` takes as many as that.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
-#[path = "common/cases.rs"]
-mod cases;
-mod common;
-#[path = "common/moved.rs"]
-mod moved;
-#[path = "common/random_scenes.rs"]
-mod random_scenes;
-
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
+use crate::common;
+use crate::common::cases;
+use crate::common::moved;
+use crate::common::random_scenes;
 use fastrand::Rng;
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};

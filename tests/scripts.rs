@@ -2,12 +2,11 @@
 //! force feels.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 
-use common::{model, scene_with, script};
+use crate::common;
+use crate::common::{model, scene_with, script};
 use glam::DVec3;
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};

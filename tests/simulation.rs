@@ -4,14 +4,12 @@
 //! own, and the same course each time.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-mod common;
-#[path = "common/random.rs"]
-mod random;
-
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 use std::task::{Context, Poll, Waker};
 
+use crate::common;
+use crate::common::random::TestRandom;
 use glam::DVec3;
 use palpate_realtime::queue::{Reader, Writer, queue};
 use palpate_refusal::Reason;
@@ -23,7 +21,6 @@ use palpate_session::{Sample, Session};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
-use random::TestRandom;
 
 const MS: u64 = 1_000_000;
 const STEPS: u64 = 1500;

@@ -10,11 +10,9 @@
     clippy::disallowed_methods
 )]
 
-#[path = "common/thin_mesh.rs"]
-mod thin_mesh;
-
 use std::sync::Arc;
 
+use crate::common::thin_mesh::thread;
 use glam::DVec3;
 use palpate_haptics::Tip;
 use palpate_tissue::limits::Limits;
@@ -22,7 +20,6 @@ use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{self as tissue, Grasp, Model, Push, Tissue};
-use thin_mesh::thread;
 
 const STEPS: u64 = 400;
 

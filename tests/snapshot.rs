@@ -1,14 +1,11 @@
 //! A session that was saved, and restored from bytes, continues with the same bits as one that never stopped.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
-#[path = "common/cases.rs"]
-mod cases;
-mod common;
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, OnceLock};
 
-use cases::on_every_core;
+use crate::common;
+use crate::common::cases::on_every_core;
 use fastrand::Rng;
 use glam::DVec3;
 use palpate_haptics::{ContactState, Coupling, Tip};

@@ -1,14 +1,12 @@
 //! Solids: the stiffness under a disc against a reference, energy, bits, snapshots, and refused scenes.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-#[path = "common/journal_opening.rs"]
-mod journal_opening;
-
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use crate::common;
+use crate::common::journal_opening;
 use glam::{DQuat, DVec3};
 use palpate_geometry::ReadLimits;
 use palpate_haptics::{ContactState, Tip, TipShape};

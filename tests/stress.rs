@@ -6,13 +6,12 @@
 //! 1,000 (`PALPATE_STRESS_SOLIDS`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/cases.rs"]
-mod cases;
-mod common;
-#[path = "common/random_scenes.rs"]
-mod random_scenes;
-
-use common::{SMALL, model, scene_with};
+use crate::common;
+use crate::common::cases;
+use crate::common::random_scenes;
+use crate::common::random_scenes::closed_mesh::closed_mesh;
+use crate::common::random_scenes::solid_case;
+use crate::common::{SMALL, model, scene_with};
 use glam::DVec3;
 use palpate_haptics::{Tip, TipShape};
 use palpate_tissue::guard::INTERVAL_SUBSTEPS;
@@ -22,8 +21,6 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::{self as tissue, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
-use random_scenes::closed_mesh::closed_mesh;
-use random_scenes::solid_case;
 
 /// Bound on the excess of the energy over the work of all tools, as a fraction of the largest energy so far and of all
 /// work: the margin of the guard, which checks every 256 substeps, and the error of estimating the work of held

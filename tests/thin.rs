@@ -11,17 +11,14 @@
     clippy::disallowed_methods
 )]
 
-#[path = "common/thin_mesh.rs"]
-mod thin_mesh;
-
 use std::sync::Arc;
 
+use crate::common::thin_mesh::{ThinMesh, thin_mesh, thread};
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::{self as tissue, Model, Tissue};
-use thin_mesh::{ThinMesh, thin_mesh, thread};
 
 /// A scene on a mesh, of a random material. One in fifty chooses its own scheme, which takes longer than the steps of a test.
 fn model(folder: &std::path::Path, mesh: &ThinMesh, dice: &mut fastrand::Rng) -> Option<Arc<Model>> {

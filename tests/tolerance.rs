@@ -2,11 +2,11 @@
 //! random meshes there are 4 here, and more by `PALPATE_TOLERANCE_MESHES`; of solids 3, `PALPATE_TOLERANCE_SOLIDS`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/cases.rs"]
-mod cases;
-#[path = "common/random_scenes.rs"]
-mod random_scenes;
-
+use crate::common::cases;
+use crate::common::random_scenes;
+use crate::common::random_scenes::{
+    PointHistory, RandomScene, case, errors, mesh_case, play, solid_case, truth, truth_within,
+};
 use palpate_refusal::Reason;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
@@ -14,7 +14,6 @@ use palpate_tissue::scene::{Named, PAPER, Precision, Scene};
 use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::scheme::stability;
 use palpate_tissue::select::scheme_selection;
-use random_scenes::{PointHistory, RandomScene, case, errors, mesh_case, play, solid_case, truth, truth_within};
 
 /// With the scheme that is chosen for each.
 fn keeps_every_tolerance(case: &RandomScene) {

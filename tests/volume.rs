@@ -2,12 +2,11 @@
 //! way.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 
-use common::{model, scene_with, schemes};
+use crate::common;
+use crate::common::{model, scene_with, schemes};
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip, TipShape};
 use palpate_refusal::Reason;
