@@ -2445,6 +2445,9 @@ pub struct Sample {
     /// always have room.
     #[prost(bool, tag = "19")]
     pub cuts_exhausted: bool,
+    /// The version of what joins the points (ViewService.GetTopology); 0 if nothing was severed.
+    #[prost(uint32, tag = "20")]
+    pub topology_version: u32,
 }
 impl ::prost::Name for Sample {
     const NAME: &'static str = "Sample";
@@ -7869,6 +7872,10 @@ pub struct GetTopologyRequest {
     /// The version that the client knows: then only what was severed since, if that is all that has changed. 0: everything.
     #[prost(uint32, tag = "2")]
     pub since_version: u32,
+    /// For a copy of the tissue from a snapshot (SessionService.SaveSnapshot): `severed` then has anchor springs too, and of each
+    /// only `name`, `part` and `version`. Needs what SaveSnapshot needs.
+    #[prost(bool, tag = "3")]
+    pub by_name: bool,
 }
 impl ::prost::Name for GetTopologyRequest {
     const NAME: &'static str = "GetTopologyRequest";
@@ -7890,7 +7897,7 @@ pub struct GetTopologyResponse {
     /// Whether the list begins after `since_version`; otherwise it replaces what the client knows.
     #[prost(bool, tag = "2")]
     pub continues: bool,
-    /// Those between points, without anchor springs, in the order in which they were severed.
+    /// Those between points, without anchor springs unless by name, in the order in which they were severed.
     #[prost(message, repeated, tag = "3")]
     pub severed: ::prost::alloc::vec::Vec<SeveredSpring>,
     /// Number of parts of the tissue; 1 if it is whole.
@@ -7927,6 +7934,9 @@ pub struct SeveredSpring {
     /// The version since which it is severed.
     #[prost(uint32, tag = "5")]
     pub version: u32,
+    /// With GetTopologyRequest.by_name.
+    #[prost(message, optional, tag = "6")]
+    pub name: ::core::option::Option<SpringName>,
 }
 impl ::prost::Name for SeveredSpring {
     const NAME: &'static str = "SeveredSpring";
@@ -7936,6 +7946,26 @@ impl ::prost::Name for SeveredSpring {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.v1.SeveredSpring".into()
+    }
+}
+/// The name of a spring in snapshots of its session.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SpringName {
+    /// The place in memory of the end that comes first there.
+    #[prost(uint32, tag = "1")]
+    pub place: u32,
+    /// Its number among the springs of that end; 4294967295 for its anchor spring.
+    #[prost(uint32, tag = "2")]
+    pub number: u32,
+}
+impl ::prost::Name for SpringName {
+    const NAME: &'static str = "SpringName";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.SpringName".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.SpringName".into()
     }
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

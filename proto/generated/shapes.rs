@@ -433,6 +433,7 @@ Field { number: 16, is_list: true, kind: FieldKind::Message(73) },
 Field { number: 17, is_list: true, kind: FieldKind::Message(68) },
 Field { number: 18, is_list: true, kind: FieldKind::Message(70) },
 Field { number: 19, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 20, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.InstrumentSample", bytes: size_of::<crate::pb::InstrumentSample>(), decode: |bytes| <crate::pb::InstrumentSample as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1071,6 +1072,7 @@ Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.GetTopologyRequest", bytes: size_of::<crate::pb::GetTopologyRequest>(), decode: |bytes| <crate::pb::GetTopologyRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 Shape { name: "palpate.v1.GetTopologyResponse", bytes: size_of::<crate::pb::GetTopologyResponse>(), decode: |bytes| <crate::pb::GetTopologyResponse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1085,6 +1087,11 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 4, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(171) },
+] },
+Shape { name: "palpate.v1.SpringName", bytes: size_of::<crate::pb::SpringName>(), decode: |bytes| <crate::pb::SpringName as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.GetWoundRequest", bytes: size_of::<crate::pb::GetWoundRequest>(), decode: |bytes| <crate::pb::GetWoundRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1096,14 +1103,14 @@ Shape { name: "palpate.v1.GetWoundResponse", bytes: size_of::<crate::pb::GetWoun
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(175) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(176) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(176) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(177) },
 Field { number: 6, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: true, kind: FieldKind::Message(173) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(174) },
+Field { number: 10, is_list: true, kind: FieldKind::Message(174) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(175) },
 ] },
 Shape { name: "palpate.v1.CutVertex", bytes: size_of::<crate::pb::CutVertex>(), decode: |bytes| <crate::pb::CutVertex as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1160,7 +1167,7 @@ Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 13, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 15, is_list: true, kind: FieldKind::Message(181) },
+Field { number: 15, is_list: true, kind: FieldKind::Message(182) },
 Field { number: 16, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 17, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
@@ -1180,7 +1187,7 @@ Shape { name: "palpate.v1.AcknowledgeFramesResponse", bytes: size_of::<crate::pb
 Shape { name: "palpate.v1.ListNodesRequest", bytes: size_of::<crate::pb::ListNodesRequest>(), decode: |bytes| <crate::pb::ListNodesRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListNodesResponse", bytes: size_of::<crate::pb::ListNodesResponse>(), decode: |bytes| <crate::pb::ListNodesResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(186) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(187) },
 ] },
 Shape { name: "palpate.v1.Node", bytes: size_of::<crate::pb::Node>(), decode: |bytes| <crate::pb::Node as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1195,7 +1202,7 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListFleetSessionsRequest", bytes: size_of::<crate::pb::ListFleetSessionsRequest>(), decode: |bytes| <crate::pb::ListFleetSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListFleetSessionsResponse", bytes: size_of::<crate::pb::ListFleetSessionsResponse>(), decode: |bytes| <crate::pb::ListFleetSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(189) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(190) },
 ] },
 Shape { name: "palpate.v1.FleetSession", bytes: size_of::<crate::pb::FleetSession>(), decode: |bytes| <crate::pb::FleetSession as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1222,7 +1229,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.ListCallersRequest", bytes: size_of::<crate::pb::ListCallersRequest>(), decode: |bytes| <crate::pb::ListCallersRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListCallersResponse", bytes: size_of::<crate::pb::ListCallersResponse>(), decode: |bytes| <crate::pb::ListCallersResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(196) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(197) },
 ] },
 Shape { name: "palpate.v1.CallerUse", bytes: size_of::<crate::pb::CallerUse>(), decode: |bytes| <crate::pb::CallerUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1236,7 +1243,7 @@ Shape { name: "palpate.v1.ListStreamsRequest", bytes: size_of::<crate::pb::ListS
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.ListStreamsResponse", bytes: size_of::<crate::pb::ListStreamsResponse>(), decode: |bytes| <crate::pb::ListStreamsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(199) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(200) },
 ] },
 Shape { name: "palpate.v1.StreamUse", bytes: size_of::<crate::pb::StreamUse>(), decode: |bytes| <crate::pb::StreamUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
@@ -1281,15 +1288,15 @@ Shape { name: "palpate.v1.CreateHereResponse", bytes: size_of::<crate::pb::Creat
 Field { number: 1, is_list: false, kind: FieldKind::Message(119) },
 ] },
 Shape { name: "palpate.v1.MirrorRequest", bytes: size_of::<crate::pb::MirrorRequest>(), decode: |bytes| <crate::pb::MirrorRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(211) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(212) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(214) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(212) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(213) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(215) },
 ] },
 Shape { name: "palpate.v1.MirrorOpen", bytes: size_of::<crate::pb::MirrorOpen>(), decode: |bytes| <crate::pb::MirrorOpen as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorParts", bytes: size_of::<crate::pb::MirrorParts>(), decode: |bytes| <crate::pb::MirrorParts as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(213) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(214) },
 ] },
 Shape { name: "palpate.v1.MirrorPart", bytes: size_of::<crate::pb::MirrorPart>(), decode: |bytes| <crate::pb::MirrorPart as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1301,7 +1308,7 @@ Shape { name: "palpate.v1.MirrorEnd", bytes: size_of::<crate::pb::MirrorEnd>(), 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorResponse", bytes: size_of::<crate::pb::MirrorResponse>(), decode: |bytes| <crate::pb::MirrorResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(216) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(217) },
 ] },
 Shape { name: "palpate.v1.Mirrored", bytes: size_of::<crate::pb::Mirrored>(), decode: |bytes| <crate::pb::Mirrored as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1310,13 +1317,13 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.TakeSessionRequest", bytes: size_of::<crate::pb::TakeSessionRequest>(), decode: |bytes| <crate::pb::TakeSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(218) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(219) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.TakeOver", bytes: size_of::<crate::pb::TakeOver>(), decode: |bytes| <crate::pb::TakeOver as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(220) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(219) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(221) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(220) },
 ] },
 Shape { name: "palpate.v1.KnownLaw", bytes: size_of::<crate::pb::KnownLaw>(), decode: |bytes| <crate::pb::KnownLaw as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1337,19 +1344,19 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(223) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(224) },
 ] },
 Shape { name: "palpate.journal.v1.Input", bytes: size_of::<crate::journal::Input>(), decode: |bytes| <crate::journal::Input as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(224) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(233) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(234) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(235) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(236) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(237) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(238) },
-Field { number: 9, is_list: false, kind: FieldKind::Message(240) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(239) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(225) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(234) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(235) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(236) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(237) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(238) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(239) },
+Field { number: 9, is_list: false, kind: FieldKind::Message(241) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(240) },
 ] },
 Shape { name: "palpate.journal.v1.Command", bytes: size_of::<crate::journal::Command>(), decode: |bytes| <crate::journal::Command as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1361,12 +1368,12 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(228) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(229) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(230) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(232) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(226) },
-Field { number: 15, is_list: false, kind: FieldKind::Message(225) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(229) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(231) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(233) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(227) },
+Field { number: 15, is_list: false, kind: FieldKind::Message(226) },
 ] },
 Shape { name: "palpate.journal.v1.Mark", bytes: size_of::<crate::journal::Mark>(), decode: |bytes| <crate::journal::Mark as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
@@ -1374,7 +1381,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.journal.v1.Tie", bytes: size_of::<crate::journal::Tie>(), decode: |bytes| <crate::journal::Tie as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(227) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(228) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1397,7 +1404,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
 Shape { name: "palpate.journal.v1.Pose", bytes: size_of::<crate::journal::Pose>(), decode: |bytes| <crate::journal::Pose as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(231) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(232) },
 ] },
 Shape { name: "palpate.journal.v1.Tip", bytes: size_of::<crate::journal::Tip>(), decode: |bytes| <crate::journal::Tip as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1444,12 +1451,12 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.journal.v1.ExerciseResult", bytes: size_of::<crate::journal::ExerciseResult>(), decode: |bytes| <crate::journal::ExerciseResult as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(244) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(245) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(241) },
-Field { number: 6, is_list: true, kind: FieldKind::Message(242) },
-Field { number: 7, is_list: true, kind: FieldKind::Message(243) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(242) },
+Field { number: 6, is_list: true, kind: FieldKind::Message(243) },
+Field { number: 7, is_list: true, kind: FieldKind::Message(244) },
 ] },
 Shape { name: "palpate.journal.v1.EarnedCriterion", bytes: size_of::<crate::journal::EarnedCriterion>(), decode: |bytes| <crate::journal::EarnedCriterion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1458,12 +1465,12 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Shape { name: "palpate.journal.v1.GivenAnswer", bytes: size_of::<crate::journal::GivenAnswer>(), decode: |bytes| <crate::journal::GivenAnswer as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(225) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(226) },
 ] },
 Shape { name: "palpate.journal.v1.PhaseResult", bytes: size_of::<crate::journal::PhaseResult>(), decode: |bytes| <crate::journal::PhaseResult as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(244) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(245) },
 ] },
 Shape { name: "palpate.journal.v1.Figure", bytes: size_of::<crate::journal::Figure>(), decode: |bytes| <crate::journal::Figure as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1479,23 +1486,23 @@ Shape { name: "palpate.journal.v1.Snapshot", bytes: size_of::<crate::journal::Sn
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(233) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(234) },
 Field { number: 5, is_list: false, kind: FieldKind::Text },
 Field { number: 6, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Felt", bytes: size_of::<crate::journal::Felt>(), decode: |bytes| <crate::journal::Felt as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(248) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(249) },
 ] },
 Shape { name: "palpate.journal.v1.Moment", bytes: size_of::<crate::journal::Moment>(), decode: |bytes| <crate::journal::Moment as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(249) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(250) },
 ] },
 Shape { name: "palpate.journal.v1.FeltTool", bytes: size_of::<crate::journal::FeltTool>(), decode: |bytes| <crate::journal::FeltTool as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(250) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(250) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(250) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(251) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(251) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(251) },
 ] },
 Shape { name: "palpate.journal.v1.Vector", bytes: size_of::<crate::journal::Vector>(), decode: |bytes| <crate::journal::Vector as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 4) },
@@ -1503,7 +1510,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 ] },
 Shape { name: "palpate.journal.v1.Waiting", bytes: size_of::<crate::journal::Waiting>(), decode: |bytes| <crate::journal::Waiting as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(223) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(224) },
 ] },
 Shape { name: "palpate.journal.v1.Signature", bytes: size_of::<crate::journal::Signature>(), decode: |bytes| <crate::journal::Signature as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1525,11 +1532,11 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(90) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(256) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(259) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(233) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(257) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(260) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(234) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 16, is_list: false, kind: FieldKind::Message(255) },
+Field { number: 16, is_list: false, kind: FieldKind::Message(256) },
 ] },
 Shape { name: "palpate.journal.v1.RecordedExercise", bytes: size_of::<crate::journal::RecordedExercise>(), decode: |bytes| <crate::journal::RecordedExercise as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1541,8 +1548,8 @@ Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(258) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(257) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(259) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(258) },
 ] },
 Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1588,7 +1595,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(262) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(263) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1604,8 +1611,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(262) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(263) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1616,7 +1623,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1625,20 +1632,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(267) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(269) },
-] },
-#[cfg(feature = "etcd")]
-Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(266) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 3, is_list: false, kind: FieldKind::Message(270) },
+] },
+#[cfg(feature = "etcd")]
+Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Message(267) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(269) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(271) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1650,20 +1657,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(273) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(271) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(271) },
-] },
-#[cfg(feature = "etcd")]
-Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
-Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(274) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(272) },
 Field { number: 3, is_list: true, kind: FieldKind::Message(272) },
 ] },
 #[cfg(feature = "etcd")]
+Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(273) },
+] },
+#[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(277) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(278) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(278) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(279) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1678,14 +1685,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(263) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(264) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1694,7 +1701,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1704,7 +1711,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1712,7 +1719,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1723,7 +1730,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1731,7 +1738,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(264) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

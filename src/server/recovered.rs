@@ -58,6 +58,7 @@ mod tests {
             late_commands: 0,
             held: false,
             cuts_exhausted: false,
+            topology_version: 0,
             recoveries,
             recovered: (recoveries > 0).then(|| Arc::new(Recovered { recovery, tools })),
             tools: Vec::new(),

@@ -1,5 +1,6 @@
 //! Splits what blades have severed into messages.
 
+use palpate_haptics::ReportedSpring;
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 use palpate_realtime::SessionHandle;
@@ -17,19 +18,23 @@ pub(super) struct TopologyParts {
 }
 
 impl TopologyParts {
-    /// Reads what is severed now, less what a client knows that has version `since_version`.
-    pub(super) fn new(handle: &SessionHandle, since_version: u32) -> Self {
+    /// Reads what is severed now, less what a client knows that has version `since_version`. `by_name`: for a copy of the tissue.
+    pub(super) fn new(handle: &SessionHandle, since_version: u32, by_name: bool) -> Self {
         let status = handle.status();
         let (cuts, model) = (&status.cuts, &status.model);
         let continues = cuts.continues(since_version);
-        let is_new = |joint: &SeveredJoint| !continues || joint.version > since_version;
+        let is_new = |version: u32| !continues || version > since_version;
         let shows_points = handle.skin.as_ref().is_none_or(|skin| !skin.is_bound());
-        let springs: Vec<_> = cuts
-            .joints(model)
-            .iter()
-            .filter(|joint| is_new(joint))
-            .map(|joint| spring(model, joint, shows_points))
-            .collect();
+        let springs: Vec<_> = if by_name {
+            cuts.reported(0).filter(|(_, version)| is_new(*version)).map(named).collect()
+        } else {
+            let joints = cuts.joints(model);
+            joints
+                .iter()
+                .filter(|joint| is_new(joint.version))
+                .map(|joint| spring(model, joint, shows_points))
+                .collect()
+        };
         TopologyParts {
             version: cuts.version(),
             continues,
@@ -61,5 +66,12 @@ fn spring(model: &Model, joint: &SeveredJoint, shows_points: bool) -> pb::Severe
         part: joint.part as f32,
         rest_m: vector(first_m.lerp(second_m, joint.part)),
         version: joint.version,
+        name: None,
     }
+}
+
+#[allow(clippy::cast_possible_truncation)]
+fn named((spring, version): (ReportedSpring, u32)) -> pb::SeveredSpring {
+    let ReportedSpring { place, number, part } = spring;
+    pb::SeveredSpring { part: part as f32, version, name: Some(pb::SpringName { place, number }), ..Default::default() }
 }

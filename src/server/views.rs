@@ -109,10 +109,12 @@ impl ViewService for Views {
         request: Request<pb::GetTopologyRequest>,
     ) -> Result<Response<Self::GetTopologyStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let pb::GetTopologyRequest { session_id, since_version } = request.into_inner();
-        let handle = self.0.seat("GetTopology", &session_id).await?.handle;
+        let pb::GetTopologyRequest { session_id, since_version, by_name } = request.into_inner();
+        // Names belong to a snapshot.
+        let call = if by_name { "SaveSnapshot" } else { "GetTopology" };
+        let handle = self.0.seat(call, &session_id).await?.handle;
         let guard = handle.open_stream("GetTopology", StreamKind::ReadsOnly, &account)?;
-        let parts = move |_: &CancelFlag| TopologyParts::new(&handle, since_version);
+        let parts = move |_: &CancelFlag| TopologyParts::new(&handle, since_version, by_name);
         let parts = self.0.job_pool.work(&account, parts).await?;
         Ok(Response::new(in_parts(parts, guard, TopologyParts::next)))
     }

@@ -158,7 +158,7 @@ impl Trainee<'_> {
         .await;
         let texture = pb::GetTextureRequest { session_id: session(), ..Default::default() };
         self.stream("/palpate.v1.ViewService/GetTexture", texture, 1000).await;
-        let topology = pb::GetTopologyRequest { session_id: session(), since_version: 0 };
+        let topology = pb::GetTopologyRequest { session_id: session(), since_version: 0, by_name: false };
         self.stream("/palpate.v1.ViewService/GetTopology", topology, 1000).await;
         let wound = pb::GetWoundRequest { session_id: session(), ..Default::default() };
         self.stream("/palpate.v1.ViewService/GetWound", wound, 1000).await;

@@ -205,6 +205,12 @@ async fn a_trainee_gets_no_call_that_shows_the_truth_and_a_trainer_advises() {
         sessions.pause_session(pb::PauseSessionRequest { session_id: id() }).await.err(),
         sessions.update_tissue(pb::UpdateTissueRequest { session_id: id(), ..Default::default() }).await.err(),
         haptics.probe(pb::ProbeRequest { session_id: id(), ..Default::default() }).await.err(),
+        server
+            .views()
+            .await
+            .get_topology(pb::GetTopologyRequest { session_id: id(), by_name: true, ..Default::default() })
+            .await
+            .err(),
         server.create(Source::Journal(journal), false).await.err(),
         exercises(&server)
             .await

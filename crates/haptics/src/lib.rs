@@ -74,6 +74,7 @@ pub mod port;
 pub mod pose_playback;
 pub mod prediction;
 pub mod renderer;
+pub mod reported_cuts;
 mod spatial_vector;
 pub mod tip;
 
@@ -92,4 +93,5 @@ pub use local_model::{ContactState, LocalModel, Touching, Track};
 pub use port::{Port, PortLoad};
 pub use prediction::{OtherTool, Predicted, Prediction, Predictor};
 pub use renderer::Renderer;
+pub use reported_cuts::{ReportedCuts, ReportedSpring};
 pub use tip::{Coupling, Tip, TipShape};

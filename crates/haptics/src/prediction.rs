@@ -33,6 +33,7 @@ use glam::DVec3;
 use crate::dead_reckoning::MotionState;
 use crate::instrument_pose::{InstrumentPose, Wrench};
 use crate::local_model::{ContactState, is_after};
+use crate::reported_cuts::ReportedCuts;
 use crate::tip::Tip;
 
 /// Time constant of the memory with which forecasts are compared, and of the mean error while other tools move, s.
@@ -115,6 +116,16 @@ pub trait Predictor: Send {
     /// s, which never goes back, and the `others`, at most [`MAX_OTHERS`], to where they are then; those that are missing have
     /// let go. Returns the wrench and contact of the tool; `None` if the copy has no answer, now or from now on.
     fn feel(&mut self, now_s: f64, pose: &InstrumentPose, others: &[OtherTool]) -> Option<Predicted>;
+
+    /// Returns the version of the topology of the server's tissue whose cuts the copy has; `None` if it follows none: it then gets no
+    /// reports of later ones.
+    fn topology_version(&self) -> Option<u32> {
+        None
+    }
+
+    /// Severs in the copy what was severed in the server's tissue. Called between two calls of [`Predictor::feel`], with the reports in
+    /// their order; it may allocate. Ignores a report that does not fit the tissue, as a whole.
+    fn follow_cuts(&mut self, _cuts: &ReportedCuts) {}
 }
 
 /// Forces computed in a tick, before the bias and the envelope.

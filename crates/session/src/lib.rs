@@ -19,6 +19,7 @@ pub mod budget;
 pub mod check;
 pub mod chosen_exercise;
 pub mod command;
+mod copied_cuts;
 pub mod current_laws;
 pub mod exercise_judge;
 pub mod felt_lump;
@@ -54,7 +55,8 @@ use glam::DVec3;
 use command::Due;
 use palpate_haptics::pose_playback::{Path, Play};
 use palpate_haptics::prediction::MAX_OTHERS;
-use palpate_haptics::{LocalModel, MotionState, OtherTool, Tip};
+use palpate_haptics::{LocalModel, MotionState, OtherTool, ReportedSpring, Tip};
+use palpate_refusal::Result;
 use palpate_tissue::memory;
 use palpate_tissue::scene::action::MAX_MARKS;
 use palpate_tissue::scene::profile::{LoadProfile, MotionProfile, Poke};
@@ -147,6 +149,8 @@ pub struct Sample {
     pub held: bool,
     /// Whether blades only push, because a solid has no room for further cuts ([`Session::cuts_exhausted`]).
     pub cuts_exhausted: bool,
+    /// The version of the topology ([`palpate_tissue::Cuts::version`]).
+    pub topology_version: u32,
     /// Number of recoveries so far: returns of the tissue to an earlier state ([`recovery`]).
     pub recoveries: u64,
     /// The newest recovery, with the tools that had acted; `None` before the first. It stays until the next one.
@@ -348,6 +352,15 @@ impl Session {
             Some(tissue) => self.tissue = tissue,
             None => self.tissue.change(model),
         }
+    }
+
+    /// Severs springs in the copy of a tissue that a client has, as its server reports them ([`Tissue::sever`]). It is no command: a
+    /// session of which a journal is written must not use it.
+    ///
+    /// # Errors
+    /// Refuses springs of which the tissue lacks one; then it severs none.
+    fn sever(&mut self, springs: &[ReportedSpring]) -> Result<()> {
+        self.tissue.sever(springs)
     }
 
     /// Requests an audit of a window of steps, which begins at the guard's next checkpoint
@@ -704,13 +717,15 @@ impl Session {
             Some(numbers) => numbers.iter().map(|number| sample_of(*number)).collect(),
             None => (0..self.tools.len() as u32).filter(in_use).map(sample_of).collect(),
         };
+        let cuts = self.tissue.cuts();
         Sample {
             step: self.step_count(),
             simulation_time_s: self.time_s(),
             awake_points: self.tissue.awake_points(),
             late_commands: self.late_commands,
             held: self.hold_reason.is_some(),
-            cuts_exhausted: self.cuts_exhausted(),
+            cuts_exhausted: !cuts.has_room(self.model()),
+            topology_version: cuts.version(),
             recoveries: self.recoveries.count(),
             recovered: self.recoveries.newest(),
             tools,

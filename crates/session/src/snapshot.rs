@@ -29,6 +29,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use super::recovery::{Acts, Ended, MAX_RECOVERIES, Recovered, Recoveries};
 use super::{Posed, Session, Tool};
+use palpate_haptics::ReportedCuts;
 use palpate_haptics::pose_playback::{Path, PathState};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
@@ -241,6 +242,14 @@ impl Saved {
         match &self.content {
             Content::Taken { state, .. } => state,
             Content::Read { parts, .. } => &parts.tissue.tissue,
+        }
+    }
+
+    /// Returns what is severed in the tissue, as a server reports it to a copy. Nothing is checked.
+    pub fn cuts(&self) -> ReportedCuts {
+        match &self.content {
+            Content::Taken { tissue, .. } => tissue.plain().parts.reported_cuts(),
+            Content::Read { parts, .. } => parts.tissue.reported_cuts(),
         }
     }
 

@@ -5,17 +5,21 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_haptics::prediction::MAX_OTHERS;
-use palpate_haptics::{ContactState, Instrument, InstrumentPose, OtherTool, Predicted, Predictor, Tip};
+use palpate_haptics::{
+    ContactState, Instrument, InstrumentPose, OtherTool, Predicted, Predictor, ReportedCuts, Tip, TipShape,
+};
 
 use super::Session;
 use super::command::{Command, Due};
+use super::copied_cuts::CopiedCuts;
 use super::rules::Rules;
 use palpate_refusal::{Result, legible, number};
 use palpate_tissue::limits::Limits;
+use palpate_tissue::memory;
 use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::scene::script::{Action, is_led};
 use palpate_tissue::shape::RestShape;
-use palpate_tissue::{Model, ToolContact};
+use palpate_tissue::{Cuts, Model, ToolContact};
 
 /// Limit of a client copy's work in a millisecond, in awake points times substeps: this takes up to 1 ms with a tip
 /// on the tissue. Beyond it the copy predicts nothing.
@@ -29,6 +33,16 @@ const TICK_S: f64 = 1e-3;
 
 /// Time behind the client's above which a copy skips to the present, s: the client has paused.
 const MAX_BEHIND_S: f64 = 0.005;
+
+/// Time after which the server should have severed what the copy's own blade has, s: some round trips of a slow network, with the
+/// report. Springs that it has not severed by then are whole.
+const CONFIRMED_S: f64 = 2.0;
+
+/// Time after which a copy begins anew even while its tool touches it, s.
+const MAX_UNCONFIRMED_S: f64 = 10.0;
+
+/// Length of the edge of another client's blade on a copy, m: it severs nothing.
+const SHEATHED_M: f64 = 1e-6;
 
 /// The work that a tool which is led by poses has done on a tissue.
 #[derive(Debug, Clone, Copy, Default)]
@@ -48,6 +62,11 @@ impl ToolWork {
             self.done_j -= 0.5 * (from_n + to_n).dot(to_m - from_m);
         }
         self.before = now;
+    }
+
+    /// Lets the work go on from the next step on: what the tool feels changes without a way.
+    fn pause(&mut self) {
+        self.before = None;
     }
 }
 
@@ -69,8 +88,14 @@ impl LedTool {
 
 /// A copy of a tissue with a client's instrument, which may be a single tip. It predicts the wrench on that between a server's
 /// samples. It begins at rest. Of the other tools it knows those that are led by poses, as far as the client does.
+///
+/// **Cuts.** The client's own blades cut it at once. What others sever, it severs when the server reports it
+/// ([`Predictor::follow_cuts`]): where their blades are now, the client only guesses. The server's tissue is the true one: if the server
+/// undoes a cut, or has not severed 2 s later what the copy has, the copy begins anew, at rest, with the server's cuts. In the second
+/// case it waits until its tool touches nothing, at most 10 s.
 pub struct TissueCopy {
     session: Session,
+    cuts: CopiedCuts,
     /// What the other tools may do: a server is not believed.
     rules: Rules,
     /// The client's instrument. Its tips are the first tools; other tools have the following ones.
@@ -103,6 +128,7 @@ impl TissueCopy {
         let tips = instrument.tips.len();
         TissueCopy {
             session: Session::new(model),
+            cuts: CopiedCuts::default(),
             rules: Rules::new(&model.scene, &Limits::default()),
             instrument,
             is_single: false,
@@ -140,6 +166,57 @@ impl TissueCopy {
         let single = instrument.tips.first().map(|tip| Instrument::of_tip(tip.tip));
         let copy = TissueCopy::of_instrument(model, instrument.clone());
         Ok(TissueCopy { is_single: single.as_ref() == Some(instrument), ..copy }.within(TICK_POINT_SUBSTEPS))
+    }
+
+    /// Returns what is severed in the copy.
+    pub fn cuts(&self) -> Cuts {
+        self.session.tissue().cuts()
+    }
+
+    /// Severs what a server reports.
+    ///
+    /// # Errors
+    /// Refuses springs of which the tissue lacks one, and missing memory; the copy then stays as it is.
+    pub fn follow(&mut self, cuts: &ReportedCuts) -> Result<()> {
+        if self.cuts.is_undone_by(cuts) {
+            return self.begin_anew(cuts);
+        }
+        self.session.sever(&cuts.springs)?;
+        self.cuts.add(cuts);
+        self.look_for_cuts();
+        Ok(())
+    }
+
+    /// Begins anew at rest, with the cuts of a report that has all. The work so far counts on.
+    fn begin_anew(&mut self, cuts: &ReportedCuts) -> Result<()> {
+        let model = self.session.model().clone();
+        let mut session = memory::attempt("snapshot", || Ok(Session::new(&model)))?;
+        session.sever(&cuts.springs)?;
+        self.session = session;
+        self.cuts.replace(cuts);
+        self.look_for_cuts();
+        self.is_led.fill(false);
+        (self.others, self.ahead_s) = ([None; MAX_OTHERS], None);
+        self.work.iter_mut().chain(&mut self.others_work).for_each(ToolWork::pause);
+        self.due.clear();
+        Ok(())
+    }
+
+    /// Notices what the copy has severed since the last look.
+    fn look_for_cuts(&mut self) {
+        self.cuts.look(&self.session.tissue().cuts(), self.session.time_s());
+    }
+
+    /// Begins anew if the server has not severed what the copy has severed long ago.
+    fn reconcile(&mut self, contact_state: ContactState) {
+        self.look_for_cuts();
+        let waits_s = if contact_state == ContactState::Free { CONFIRMED_S } else { MAX_UNCONFIRMED_S };
+        let time_s = self.session.time_s();
+        if self.cuts.unconfirmed_since_s().is_some_and(|since_s| time_s - since_s > waits_s) {
+            let cuts = self.cuts.reported();
+            // Without memory for it, the copy stays as it is.
+            let _ = self.begin_anew(&cuts);
+        }
     }
 
     /// Steps until `now_s`, with the instrument on its way to `pose`, and the others on theirs. The number of steps is
@@ -205,7 +282,7 @@ impl TissueCopy {
             let has = |led_tool: &Option<LedTool>| led_tool.is_some_and(|led_tool| led_tool.tool == other.tool);
             let slot = self.others.iter().position(has).or_else(|| self.others.iter().position(Option::is_none));
             let Some(slot) = slot else { continue };
-            let due = led(tool_at(tips + slot), other.motion.at(time_s), other.tip);
+            let due = led(tool_at(tips + slot), other.motion.at(time_s), blunt(other.tip));
             if self.rules.check_one(&due.command).is_err() {
                 continue;
             }
@@ -232,6 +309,15 @@ fn most_radius_m(shape: &dyn RestShape) -> f64 {
     MAX_EDGES * shape.edge_m()
 }
 
+/// Returns the tip of another client's tool as it is on a copy, where it severs nothing.
+fn blunt(tip: Tip) -> Tip {
+    let edge_m = match tip.shape {
+        TipShape::Blade => SHEATHED_M * tip.edge_m.normalize_or(DVec3::Z),
+        TipShape::Disc | TipShape::RigidDisc | TipShape::Sphere => tip.edge_m,
+    };
+    Tip { edge_m, burn_s: 0.0, ..tip }
+}
+
 /// Returns the command that leads a tool to a place within the next step.
 fn led(tool: u32, place_m: DVec3, tip: Tip) -> Due {
     Due::in_time(Command::new(tool, None, Action::Pose { place_m, velocity_m_per_s: None, tip }))
@@ -249,9 +335,20 @@ impl Predictor for TissueCopy {
         let wrench = self.instrument.wrench(&self.instrument.lead(pose), forces);
         // A tip that holds, sticks or slides says so for all.
         let touching = felt().map(|(_, contact)| contact.contact_state).find(|state| *state != ContactState::Free);
+        let contact_state = touching.unwrap_or(ContactState::Free);
         let [own_work_j, others_work_j] =
             [&self.work[..], &self.others_work].map(|works| works.iter().map(|work| work.done_j).sum());
-        Some(Predicted { wrench, contact_state: touching.unwrap_or(ContactState::Free), own_work_j, others_work_j })
+        self.reconcile(contact_state);
+        Some(Predicted { wrench, contact_state, own_work_j, others_work_j })
+    }
+
+    fn topology_version(&self) -> Option<u32> {
+        Some(self.cuts.version)
+    }
+
+    fn follow_cuts(&mut self, cuts: &ReportedCuts) {
+        // A server is not believed: a report that makes no sense is ignored.
+        let _ = self.follow(cuts);
     }
 }
 
@@ -263,6 +360,9 @@ impl std::fmt::Debug for TissueCopy {
         fields.finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+mod cut_tests;
 
 #[cfg(test)]
 mod tests {

@@ -20,7 +20,7 @@ use crate::tools::applied_force::Push;
 use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
 use crate::tools::tie::TieState;
-use palpate_haptics::Tip;
+use palpate_haptics::{ReportedSpring, Tip};
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on it, as vectors in the
 /// tissue's frame. Where the applied force jumps, this is the value just before the jump; at step 0, just after
@@ -237,6 +237,12 @@ pub trait Tissue: Send {
     fn substeps_done(&self) -> u64;
     /// Returns what blades have severed.
     fn cuts(&self) -> Cuts;
+    /// Severs the whole ones of some springs at the present step, as a blade does in one: for a client's copy of a tissue, whose cuts its
+    /// server reports. It is no input of a tool, so no journal has it. Call it between steps, not within an unfinished one.
+    ///
+    /// # Errors
+    /// Refuses springs of which the tissue lacks one ([`Reason::OutOfRange`](palpate_refusal::Reason::OutOfRange)); then it severs none.
+    fn sever(&mut self, springs: &[ReportedSpring]) -> palpate_refusal::Result<()>;
     /// Returns the number of points that a step computes now; the others are at rest. 0 if the whole tissue
     /// sleeps.
     fn awake_points(&self) -> usize;

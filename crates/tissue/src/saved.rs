@@ -17,7 +17,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate_haptics::{Coupling, Tip, TipShape};
+use palpate_haptics::{Coupling, ReportedCuts, ReportedSpring, Tip, TipShape};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::limits::Limits;
@@ -164,6 +164,18 @@ pub struct TissueParts {
     /// The energy that has gone into cuts, behind these.
     #[serde(skip)]
     pub fracture: SavedFracture,
+}
+
+impl TissueParts {
+    /// Returns all that is severed, as a server reports it. Nothing is checked.
+    pub fn reported_cuts(&self) -> ReportedCuts {
+        let of = |spring: &SavedSpring| {
+            let SavedSpring { place, number, part, .. } = *spring;
+            ReportedSpring { place, number, part }
+        };
+        let springs = self.severed.iter().map(of).collect();
+        ReportedCuts { version: self.topology_version, continues: false, springs }
+    }
 }
 
 /// The state that the guard goes back to.

@@ -33,7 +33,7 @@ pub(crate) async fn create(server: &TestServer, source: pb::create_session_reque
 }
 
 pub(crate) async fn topology(server: &TestServer, session_id: &str, since_version: u32) -> pb::GetTopologyResponse {
-    let request = pb::GetTopologyRequest { session_id: session_id.to_owned(), since_version };
+    let request = pb::GetTopologyRequest { session_id: session_id.to_owned(), since_version, by_name: false };
     let mut parts = server.views().await.get_topology(request).await.unwrap().into_inner();
     let mut whole = pb::GetTopologyResponse::default();
     while let Some(part) = parts.message().await.unwrap() {

@@ -3,6 +3,7 @@
 pub(crate) mod blades;
 mod commands;
 mod contact;
+mod copies;
 mod instruments;
 mod laws;
 mod poses;

@@ -1,4 +1,4 @@
-//! Fetches a session's tissue and builds a local copy of it, in parallel with the haptic stream.
+//! Fetches a session's tissue and builds a local copy of it, in parallel with the haptic stream; then what is severed in that tissue.
 
 use std::sync::Arc;
 
@@ -8,12 +8,12 @@ use pb::session_service_client::SessionServiceClient;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
-use super::{Copies, copy_thread};
+use super::Copies;
+use super::copy_thread::{self, MadeCopy};
+use super::cut_fetch::CutsFollower;
 use crate::Error;
 use crate::connect::Channel;
 use crate::snapshot;
-
-type Made = Result<Box<dyn Predictor>, Error>;
 
 /// Limit on the bytes of a snapshot: no client could step a larger tissue in time.
 const MAX_BYTES: usize = 64 << 20;
@@ -40,7 +40,8 @@ pub(super) struct Copying {
     /// `None`: this tissue is not copied.
     copier: Option<Copier>,
     /// At most one task, which is aborted when this is dropped.
-    under_way: JoinSet<Made>,
+    under_way: JoinSet<Result<MadeCopy, Error>>,
+    follower: CutsFollower,
 }
 
 impl Copying {
@@ -57,7 +58,9 @@ impl Copying {
             of.role() == pb::ExerciseRole::Trainee && of.exercise.as_ref().is_some_and(|exercise| exercise.hides_truth)
         });
         let copier = copier.filter(|copier| !is_hidden && (!is_grid || copier.copies.of_grids)).cloned();
-        Copying { channel, session_id: session.session_id.clone(), instrument, copier, under_way: JoinSet::new() }
+        let session_id = session.session_id.clone();
+        let follower = CutsFollower::new(channel.clone(), session_id.clone());
+        Copying { channel, session_id, instrument, copier, under_way: JoinSet::new(), follower }
     }
 
     /// Returns whether this tissue is copied.
@@ -67,6 +70,7 @@ impl Copying {
 
     /// Starts building a copy of the current tissue. Aborts an earlier one that is not finished.
     pub(super) fn begin(&mut self) {
+        self.follower.follow(None);
         self.under_way.abort_all();
         self.under_way.detach_all();
         let Some(Copier { copies: Copies { make, .. }, places }) = self.copier.clone() else { return };
@@ -85,11 +89,22 @@ impl Copying {
         });
     }
 
-    /// Returns the copy, once it is built. Dropping the future loses nothing.
-    pub(super) async fn next(&mut self) -> Made {
-        match self.under_way.join_next().await {
-            Some(made) => made.map_err(|_| Error::Internal("fetching the tissue panicked".to_owned())).flatten(),
-            None => std::future::pending().await,
+    /// Fetches what was severed for the copy, if it lacks the version of the topology in a sample.
+    pub(super) fn look(&mut self, topology_version: u32) {
+        self.follower.look(topology_version);
+    }
+
+    /// Returns the copy, once it is built, and passes reports of cuts to it meanwhile. Dropping the future loses nothing.
+    pub(super) async fn next(&mut self) -> Result<Box<dyn Predictor>, Error> {
+        loop {
+            tokio::select! {
+                Some(made) = self.under_way.join_next() => {
+                    let made = made.map_err(|_| Error::Internal("fetching the tissue panicked".to_owned())).flatten()?;
+                    self.follower.follow(made.cuts);
+                    return Ok(made.copy);
+                }
+                () = self.follower.passed_on() => {}
+            }
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Builds and steps a copy of the tissue on a thread of its own. The server decides how large the tissue is, so a
 //! step may take long: the device's loop never waits for one. It leaves its newest place in one slot and finds in
-//! another what the tool felt at an earlier place, usually that of the last tick.
+//! another what the tool felt at an earlier place, usually that of the last tick. What the server reports of cuts comes to this
+//! thread from that of the network, and does not pass through the loop either.
 
 use std::io;
 use std::sync::Arc;
@@ -9,10 +10,10 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_haptics::prediction::MAX_OTHERS;
-use palpate_haptics::{InstrumentPose, OtherTool, Predicted, Predictor};
+use palpate_haptics::{InstrumentPose, OtherTool, Predicted, Predictor, ReportedCuts};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 
-use crate::exchange::{NewestReader, NewestWriter, newest};
+use crate::exchange::{NewestReader, NewestWriter, QueueReader, QueueWriter, newest, queue};
 
 /// Age above which a result is not rendered, s: local models are more accurate then.
 const MAX_LATE_S: f64 = 0.0045;
@@ -67,18 +68,53 @@ impl Drop for Stepped {
     }
 }
 
+/// Largest number of reports of cuts that wait for the thread.
+const REPORTS: usize = 4;
+
+/// The end of the network: what the copy learns of cuts.
+pub(super) struct CutsWriter {
+    reports: QueueWriter<ReportedCuts>,
+    /// The version of the topology that the copy has, once it has read all reports.
+    version: u32,
+}
+
+impl CutsWriter {
+    /// Returns the version of the topology that the copy has, with the reports so far.
+    pub(super) fn version(&self) -> u32 {
+        self.version
+    }
+
+    /// Passes a report to the copy. Drops it if too many wait: the version then stays.
+    pub(super) fn report(&mut self, cuts: ReportedCuts) {
+        let version = cuts.version;
+        if self.reports.push(cuts).is_ok() {
+            self.version = version;
+        }
+    }
+}
+
+/// A copy that was made: the end of the loop, and that of the network if the copy follows cuts.
+pub(super) struct MadeCopy {
+    pub(super) copy: Box<dyn Predictor>,
+    pub(super) cuts: Option<CutsWriter>,
+}
+
 /// The end of the stepping thread.
 struct Stepper {
     places: NewestReader<ToolsThen>,
     /// The other tools at the newest place.
     others: Vec<OtherTool>,
     felt: NewestWriter<Felt>,
+    reports: QueueReader<ReportedCuts>,
     is_over: Arc<AtomicBool>,
 }
 
 impl Stepper {
-    /// Steps the copy to the newest place. Returns whether there was a new one.
+    /// Passes the reports of cuts to the copy, and steps it to the newest place. Returns whether there was a new one.
     fn step(&mut self, copy: &mut dyn Predictor) -> bool {
+        while let Some(cuts) = self.reports.pop() {
+            copy.follow_cuts(&cuts);
+        }
         if !self.places.refresh() {
             return false;
         }
@@ -109,15 +145,16 @@ impl Stepper {
     }
 }
 
-/// Creates the two ends of a copy.
-fn ends() -> (Stepped, Stepper) {
+/// Creates the ends of a copy: of the loop, the stepping thread and the network.
+fn ends() -> (Stepped, Stepper, QueueWriter<ReportedCuts>) {
     let (places, to_step) =
         newest(&ToolsThen { now_s: 0.0, pose: InstrumentPose::at(DVec3::ZERO), others: [None; MAX_OTHERS] });
     let (told, felt) = newest(&Felt { now_s: f64::NEG_INFINITY, felt: None });
     let is_over = Arc::new(AtomicBool::new(false));
-    let stepper =
-        Stepper { places: to_step, others: Vec::with_capacity(MAX_OTHERS), felt: told, is_over: is_over.clone() };
-    (Stepped { places, felt, is_over }, stepper)
+    let (reporting, reports) = queue(REPORTS);
+    let others = Vec::with_capacity(MAX_OTHERS);
+    let stepper = Stepper { places: to_step, others, felt: told, reports, is_over: is_over.clone() };
+    (Stepped { places, felt, is_over }, stepper, reporting)
 }
 
 /// Runs `make` on the thread that will step its result, and returns the future result. Drops `permit` when that
@@ -125,15 +162,16 @@ fn ends() -> (Stepped, Stepper) {
 pub(super) fn made_apart(
     make: impl FnOnce() -> Result<Box<dyn Predictor>, String> + Send + 'static,
     permit: OwnedSemaphorePermit,
-) -> io::Result<oneshot::Receiver<Result<Box<dyn Predictor>, String>>> {
+) -> io::Result<oneshot::Receiver<Result<MadeCopy, String>>> {
     let (tell, made) = oneshot::channel();
     // Not a thread of the runtime: the runtime would wait for it when it ends.
     std::thread::Builder::new().name("copy".to_owned()).spawn(move || {
         let _permit = permit;
         match make() {
             Ok(mut copy) => {
-                let (stepped, stepper) = ends();
-                if tell.send(Ok(Box::new(stepped) as Box<dyn Predictor>)).is_ok() {
+                let (stepped, stepper, reports) = ends();
+                let cuts = copy.topology_version().map(|version| CutsWriter { reports, version });
+                if tell.send(Ok(MadeCopy { copy: Box::new(stepped), cuts })).is_ok() {
                     stepper.run(&mut *copy);
                 }
             }
@@ -173,7 +211,7 @@ mod tests {
 
     #[test]
     fn a_tick_gets_what_was_felt_at_the_last_one_and_nothing_old() {
-        let (mut stepped, mut stepper) = ends();
+        let (mut stepped, mut stepper, _) = ends();
         let place_m = |tick: u32| DVec3::new(0.0, 0.0, -1e-4 * f64::from(tick));
         let at = |tick: u32| InstrumentPose::at(place_m(tick));
         for tick in 0..50 {
@@ -202,6 +240,41 @@ mod tests {
         }
     }
 
+    /// A copy that counts what is severed.
+    struct CountingCuts(u32);
+
+    impl Predictor for CountingCuts {
+        fn feel(&mut self, _: f64, _: &InstrumentPose, _: &[OtherTool]) -> Option<Predicted> {
+            Some(pressed(f64::from(self.0) * DVec3::Z))
+        }
+
+        fn topology_version(&self) -> Option<u32> {
+            Some(self.0)
+        }
+
+        fn follow_cuts(&mut self, cuts: &ReportedCuts) {
+            self.0 += cuts.version;
+        }
+    }
+
+    #[test]
+    fn reports_of_cuts_reach_the_copy_before_its_next_step_and_few_wait() {
+        let (mut stepped, mut stepper, reports) = ends();
+        let mut copy = CountingCuts(7);
+        let mut cuts = CutsWriter { reports, version: copy.0 };
+        (10..20).for_each(|version| cuts.report(ReportedCuts { version, ..ReportedCuts::default() }));
+        // The version is that of the last report that was passed on: the others are fetched again.
+        assert_eq!(cuts.version(), 13);
+        let at_rest = InstrumentPose::at(DVec3::ZERO);
+        assert_eq!(stepped.feel(0.0, &at_rest, &[]), None);
+        assert!(stepper.step(&mut copy));
+        let summed = 7 + (10..14).sum::<u32>();
+        assert_eq!(stepped.feel(1e-3, &at_rest, &[]), Some(pressed(f64::from(summed) * DVec3::Z)));
+        cuts.report(ReportedCuts { version: 20, ..ReportedCuts::default() });
+        assert_eq!(cuts.version(), 20);
+        assert!(stepper.step(&mut copy) && copy.0 == summed + 20);
+    }
+
     #[test]
     fn a_step_that_does_not_end_holds_up_no_tick_and_keeps_its_place() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
@@ -210,7 +283,7 @@ mod tests {
             let (end, ended) = mpsc::channel();
             let permit = places.clone().acquire_owned().await.unwrap();
             let made = made_apart(move || Ok(Box::new(Endless(ended))), permit).unwrap();
-            let mut copy = made.await.unwrap().unwrap();
+            let mut copy = made.await.unwrap().unwrap().copy;
             // This thread gets past although no step ends.
             assert!(
                 (0..1000)

@@ -374,7 +374,8 @@ async fn connect(
     let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
     // Counts of earlier connections.
     let before = shared.inbound().traffic.carried;
-    let take = |sample: &pb::Sample, datagrams: &mut Datagrams, feed: &mut LoopFeed| {
+    let take = |sample: &pb::Sample, datagrams: &mut Datagrams, copying: &mut Copying, feed: &mut LoopFeed| {
+        copying.look(sample.topology_version);
         let now = datagrams.carried();
         {
             let mut inbound = shared.inbound();
@@ -425,7 +426,7 @@ async fn connect(
                         }
                         if trail.is_current(sample.ownership_revision) && datagrams.is_newer(&sample) {
                             look(&sample, &mut cutting, &mut released);
-                            take(&sample, &mut datagrams, feed);
+                            take(&sample, &mut datagrams, &mut copying, feed);
                         }
                     }
                     // A datagram with the tip of before that the release has overtaken.
@@ -462,7 +463,7 @@ async fn connect(
             sample = datagrams.next() => {
                 if trail.is_current(sample.ownership_revision) {
                     look(&sample, &mut cutting, &mut released);
-                    take(&sample, &mut datagrams, feed);
+                    take(&sample, &mut datagrams, &mut copying, feed);
                 }
             }
             command = commands.recv() => {

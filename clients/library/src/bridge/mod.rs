@@ -9,6 +9,7 @@
 mod copy_fetch;
 mod copy_thread;
 mod cut_button;
+mod cut_fetch;
 mod hand_slot;
 mod hands;
 mod lateness;

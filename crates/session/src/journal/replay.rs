@@ -583,14 +583,14 @@ pub fn resume(reader: JournalReader<'_>, limits: &Limits) -> Result<Resumed> {
     resume_as(reader, limits, None)
 }
 
-/// Returns a copy of the tissue in an encoded journal with at least one snapshot (the last counts), at rest, for a
-/// client's `instrument`, which may be a single tip. It can be stepped at 1 kHz. The session's steps and tools are not restored.
+/// Returns a copy of the tissue in an encoded journal with at least one snapshot (the last counts), at rest and cut as in the snapshot, for
+/// a client's `instrument`, which may be a single tip. It can be stepped at 1 kHz. The session's steps and tools are not restored.
 ///
 /// # Errors
 /// Returns a message if the bytes are no such journal or of another generation, if the tissue has more than 100,000
 /// points or is invalid, if a tip does not fit the tissue or is too large ([`TissueCopy::for_client`]), or if
 /// memory is missing.
-pub fn prediction(bytes: &[u8], instrument: &Instrument) -> std::result::Result<Box<dyn Predictor>, String> {
+pub fn tissue_copy(bytes: &[u8], instrument: &Instrument) -> std::result::Result<TissueCopy, String> {
     #[allow(clippy::cast_possible_truncation)]
     let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
     let copy = || {
@@ -601,11 +601,20 @@ pub fn prediction(bytes: &[u8], instrument: &Instrument) -> std::result::Result<
         let Some(at) = survey.snapshots.last() else { return Err(reader.refuse("has no snapshot")) };
         let first = message::model(reader.header(), &limits)?;
         let (_, snapshot, _) = snapshot(&mut reader, at)?;
-        let (_, model) = saved(&snapshot, &first, &limits)?;
-        TissueCopy::for_client(&model, instrument)
+        let (saved, model) = saved(&snapshot, &first, &limits)?;
+        let mut copy = TissueCopy::for_client(&model, instrument)?;
+        copy.follow(&saved.cuts())?;
+        Ok(copy)
     };
-    let copy = memory::attempt("snapshot", copy).map_err(|refusal| refusal.to_string())?;
-    Ok(Box::new(copy))
+    memory::attempt("snapshot", copy).map_err(|refusal| refusal.to_string())
+}
+
+/// Returns the [`tissue_copy`] as the predictor that a bridge makes of a server's snapshot.
+///
+/// # Errors
+/// Returns the messages of [`tissue_copy`].
+pub fn prediction(bytes: &[u8], instrument: &Instrument) -> std::result::Result<Box<dyn Predictor>, String> {
+    Ok(Box::new(tissue_copy(bytes, instrument)?))
 }
 
 /// A journal's header and the compiled tissue with which its session began, for reuse by [`resume_as`].

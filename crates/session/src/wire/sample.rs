@@ -63,6 +63,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
         asleep: sample.awake_points == 0,
         held: sample.held,
         cuts_exhausted: sample.cuts_exhausted,
+        topology_version: sample.topology_version,
         late_commands: sample.late_commands,
         dropped_samples: dropped,
         recovery_count: sample.recoveries,

@@ -15,6 +15,7 @@ use crate::body::model::Model;
 use crate::body::solid::corner_copies::{CornerCopies, DoubledCorner};
 use crate::saved::{SavedSpring, ensure, unsound};
 use crate::shape::PointId;
+use palpate_haptics::ReportedSpring;
 use palpate_refusal::Result;
 
 /// Versions in a snapshot are below this, so that counting on does not overflow.
@@ -118,6 +119,15 @@ impl Cuts {
             version: spring.version,
         };
         self.springs.iter().filter(|spring| !spring.is_anchor()).map(of).collect()
+    }
+
+    /// Returns the severed springs from number `from` of their order on, anchor springs included, by the names that they have in a snapshot,
+    /// each with the version of the topology since which it is severed.
+    pub fn reported(&self, from: usize) -> impl Iterator<Item = (ReportedSpring, u32)> {
+        self.springs.iter().skip(from).map(|spring| {
+            let SeveredSpring { ends: [place, _], number, part, version } = *spring;
+            (ReportedSpring { place, number, part }, version)
+        })
     }
 
     /// Returns the number of parts into which the severed springs divide the tissue: 1 for one that is whole. Points that the model
@@ -225,19 +235,7 @@ impl Cuts {
         for SavedSpring { place, number, part, version: since } in saved.iter().copied() {
             let last = severed.springs.last().map_or(1, |last| last.version);
             ensure((last..=version).contains(&since), "a severed spring of another version of the topology")?;
-            ensure((0.0..=1.0).contains(&part), "a spring severed beyond its ends")?;
-            ensure((place as usize) < model.place_count(), "a severed spring at a place that the tissue lacks")?;
-            let spring = if number == ANCHOR {
-                ensure(model.has_severable_anchor(place as usize), "a severed anchor spring that the tissue lacks")?;
-                SeveredSpring::anchor(place as usize, part, since)
-            } else {
-                let found =
-                    model.springs_at(place as usize).into_iter().find(|spring| spring.number == number as usize);
-                let other = found.map(|spring| spring.other).filter(|other| *other > place as usize);
-                let other = other.and_then(|other| u32::try_from(other).ok());
-                let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
-                SeveredSpring { ends: [place, other], number, part, version: since }
-            };
+            let spring = SeveredSpring::named(model, ReportedSpring { place, number, part }, since)?;
             ensure(severed.has_room(model), "more severed springs than the tissue has room for")?;
             ensure(severed.add(model, spring).is_some(), "a spring that is severed twice")?;
         }
@@ -370,6 +368,25 @@ impl Severed {
 }
 
 impl SeveredSpring {
+    /// Returns the spring of a name, severed since a version of the topology.
+    ///
+    /// # Errors
+    /// Refuses a spring that the tissue lacks, and a part of its way that is not from 0 to 1.
+    pub(crate) fn named(model: &Model, spring: ReportedSpring, version: u32) -> Result<Self> {
+        let ReportedSpring { place, number, part } = spring;
+        ensure((0.0..=1.0).contains(&part), "a spring severed beyond its ends")?;
+        ensure((place as usize) < model.place_count(), "a severed spring at a place that the tissue lacks")?;
+        if number == ANCHOR {
+            ensure(model.has_severable_anchor(place as usize), "a severed anchor spring that the tissue lacks")?;
+            return Ok(SeveredSpring::anchor(place as usize, part, version));
+        }
+        let found = model.springs_at(place as usize).into_iter().find(|spring| spring.number == number as usize);
+        let other = found.map(|spring| spring.other).filter(|other| *other > place as usize);
+        let other = other.and_then(|other| u32::try_from(other).ok());
+        let other = other.ok_or_else(|| unsound("a severed spring that the tissue lacks"))?;
+        Ok(SeveredSpring { ends: [place, other], number, part, version })
+    }
+
     /// Returns the severed anchor spring of the point at a place in memory. `part` is that of the way from the point to where it is
     /// attached.
     #[allow(clippy::cast_possible_truncation)]

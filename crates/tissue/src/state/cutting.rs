@@ -1,4 +1,5 @@
-//! What is severed in a step: by the edges of blades (anchor springs in `anchors`), by heat (`burning`), and by strain (`tearing`).
+//! What is severed in a step: by the edges of blades (anchor springs in `anchors`), by heat (`burning`), and by strain (`tearing`). And
+//! between two steps: what a server reports (`reported`).
 //!
 //! In a step the edge of a blade sweeps a surface, from the line between its tip and its heel at the step's beginning to that at
 //! the step's end: two triangles. A spring that crosses one of them is severed. The tissue moves as well, so the edge
@@ -140,8 +141,14 @@ impl<T: Real> TissueState<T> {
         crossings.extend(self.torn());
         crossings.sort_unstable_by_key(|crossing| (crossing.place, crossing.spring.number));
         crossings.dedup_by_key(|crossing| (crossing.place, crossing.spring.number));
+        self.sever_all(&crossings);
+        self.ended(StepStage::Contact);
+    }
+
+    /// Severs the whole ones of some springs, in a new version of the topology. Returns whether there was any.
+    fn sever_all(&mut self, crossings: &[Crossing]) -> bool {
         if crossings.is_empty() || !self.tables.severed.has_room(&self.model) {
-            return self.ended(StepStage::Contact);
+            return false;
         }
         let version = self.tables.severed.version() + 1;
         let mut any = false;
@@ -149,7 +156,7 @@ impl<T: Real> TissueState<T> {
         self.contacts.follow_cuts(&self.model, None);
         self.applied.give_up_copies();
         for crossing in crossings {
-            any |= self.sever(&crossing, version);
+            any |= self.sever(crossing, version);
         }
         self.follow_cuts();
         if any {
@@ -157,7 +164,7 @@ impl<T: Real> TissueState<T> {
             // A twin that steps otherwise severs other springs: that is no error of the stepping.
             self.audit_window.give_up();
         }
-        self.ended(StepStage::Contact);
+        any
     }
 
     /// Lets tools act on the copies of corners that there are now, and tiles sleep as far as the anchors that are left allow.
@@ -308,6 +315,7 @@ impl<T: Real> TissueState<T> {
 mod anchors;
 mod burning;
 mod faces;
+mod reported;
 mod tearing;
 #[cfg(test)]
 mod tests;

@@ -38,7 +38,7 @@ use crate::tools::contact::{Contacts, TangentInput, ToolContact};
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::{Grasp, Prescribed};
 use crate::tools::tie::TieState;
-use palpate_haptics::{ContactState, Tip};
+use palpate_haptics::{ContactState, ReportedSpring, Tip};
 
 /// Creates a tissue at rest, at step 0 and without tools, in the number format of the model: f64 for
 /// [`Precision::F64`], otherwise f32. Unwinds with a refusal if there is no memory for its state
@@ -344,6 +344,10 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn cuts(&self) -> Cuts {
         self.tables.severed.cuts().clone()
+    }
+
+    fn sever(&mut self, springs: &[ReportedSpring]) -> palpate_refusal::Result<()> {
+        self.sever_reported(springs)
     }
 
     fn awake_points(&self) -> usize {
