@@ -499,7 +499,8 @@ fn what_sleeps_and_wakes_has_the_same_bits_at_every_width() {
 
 fn first_n_per_m(model: &Model) -> f64 {
     let disc = Disc::in_middle(model, Tip::default().radius_m);
-    force_law::first(model, disc, &AtomicBool::new(false)).unwrap().rows[0].stiffness_n_per_m
+    force_law::first(model, &palpate_tissue::Cuts::default(), disc, &AtomicBool::new(false)).unwrap().rows[0]
+        .stiffness_n_per_m
 }
 
 #[test]

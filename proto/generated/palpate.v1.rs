@@ -2132,9 +2132,9 @@ impl ::prost::Name for ForceLaw {
         "/palpate.v1.ForceLaw".into()
     }
 }
-/// Another force law, for one of three reasons: the exact law replaces a coarse one, the tissue has changed
-/// (`tissue_step`), or the tool (the first of `TouchOpen.tools`) has come within four radii of the surface at a place
-/// with another law. A sheet has the law of its middle everywhere except near its rim and its fixed points; there, and
+/// Another force law, for one of four reasons: the exact law replaces a coarse one, the tissue has changed
+/// (`tissue_step`), the tool (the first of `TouchOpen.tools`) has come within four radii of the surface at a place
+/// with another law, or something was severed near there. A sheet has the law of its middle everywhere except near its rim, its fixed points and cuts; there, and
 /// on a mesh, the law follows a tool that moves by more than half to a whole radius. Other tools are ignored: the law
 /// is that of the tissue with this tool alone. A coarse law is followed by the exact law of that tissue and place. A
 /// client that does not know this message continues with its law: with any law, local models contain the force of

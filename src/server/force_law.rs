@@ -1,7 +1,8 @@
 //! The force laws of a haptic stream: the force on a tool's tip as a function of its depth, which the client
 //! evaluates locally. A stream starts with a coarse law that is available immediately, and gets the exact one when it
 //! is computed. Both are computed anew when the tissue changes, and when the tool has moved to a place with another
-//! law ([`Disc::follow`]).
+//! law ([`Disc::follow_cut`]). Near a cut they are those of the cut tissue, and computed anew when more is severed; until then the stream
+//! keeps the law of before.
 
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -23,8 +24,8 @@ use palpate_realtime::law_cache::{SoughtLaw, have_same_laws};
 use palpate_session::Sample;
 use palpate_session::budget::Account;
 use palpate_session::current_laws::{FIRST, Laws};
-use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
+use palpate_tissue::{Cuts, Model};
 
 /// After computing the laws of a place, the pause before those of the next place is this multiple of the time they
 /// took, but at most `LONGEST_PAUSE`.
@@ -43,6 +44,15 @@ struct LawUpdate {
     law: Result<(u32, Arc<Law>), Status>,
 }
 
+/// What a tool presses.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct PressedPlace {
+    /// The point of the surface at rest, m.
+    rest_m: DVec3,
+    /// The version of the topology.
+    topology_version: u32,
+}
+
 /// The updates of a stream's force law after its opening, and the place of its tool.
 pub(super) struct Updates {
     told: mpsc::Receiver<LawUpdate>,
@@ -50,8 +60,7 @@ pub(super) struct Updates {
     /// The tool that the laws are computed for: the first of the stream's tools.
     tool: Option<u32>,
     tip: Disc,
-    /// The point of the surface at rest that the tool presses, m.
-    place_m: watch::Sender<Option<DVec3>>,
+    place: watch::Sender<Option<PressedPlace>>,
 }
 
 impl Updates {
@@ -60,10 +69,12 @@ impl Updates {
         let of_tool = sample.tools.iter().find(|tool| Some(tool.tool) == self.tool);
         let feel = of_tool.and_then(|tool| tool.feel.as_ref());
         let Some(rest_m) = feel.and_then(|feel| self.tip.pressed_m(feel)) else { return };
-        self.place_m.send_if_modified(|told| {
-            let is_news = told.is_none_or(|told_m| told_m.distance(rest_m) > NEWS_IN_RADII * self.tip.radius_m);
+        let topology_version = sample.topology_version;
+        let is_far = |told_m: DVec3| told_m.distance(rest_m) > NEWS_IN_RADII * self.tip.radius_m;
+        self.place.send_if_modified(|told| {
+            let is_news = told.is_none_or(|told| is_far(told.rest_m) || told.topology_version != topology_version);
             if is_news {
-                *told = Some(rest_m);
+                *told = Some(PressedPlace { rest_m, topology_version });
             }
             is_news
         });
@@ -94,8 +105,9 @@ struct Known {
     number: u32,
     /// The tissue that the law describes, or that has no law.
     model: Arc<Model>,
-    /// The place that the law describes.
+    /// The place that the law describes, and the version of the topology if it notices what is severed.
     disc: Disc,
+    topology_version: Option<u32>,
     /// Whether the exact law is still to come.
     is_coarse: bool,
     /// Whether laws of other places can be computed. A sheet has only exact ones, so none if one of them can't be
@@ -121,24 +133,24 @@ impl Maker {
     }
 
     /// Returns the law of `disc`: for a caller from whom something is hidden, that of the tissue without it.
-    fn sought(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>, Status> {
+    fn sought(&self, model: &Arc<Model>, cuts: &Cuts, disc: Disc) -> Result<Arc<SoughtLaw>, Status> {
         let law = match self.seat.hidden() {
-            Some(_) => self.seat.handle.plain_law(disc),
-            None => self.seat.handle.law(model, disc),
+            Some(_) => self.seat.handle.plain_law(cuts, disc),
+            None => self.seat.handle.law(model, cuts, disc),
         };
         Ok(law?)
     }
 
-    /// Computes the first law of `disc`: at most 50 ms of work.
-    async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
-        let sought = self.sought(model, disc)?;
+    /// Computes the first law of `disc`: at most 50 ms of work, on a whole tissue.
+    async fn first(&self, model: &Arc<Model>, cuts: &Cuts, disc: Disc) -> Result<Arc<Law>, Status> {
+        let sought = self.sought(model, cuts, disc)?;
         let law = self.job_pool.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??;
         Ok(self.of_tip(law, model, disc))
     }
 
     /// Computes the exact law of `disc`, depth by depth. Between two depths other work can run, also of this caller.
-    async fn exact(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
-        let sought = self.sought(model, disc)?;
+    async fn exact(&self, model: &Arc<Model>, cuts: &Cuts, disc: Disc) -> Result<Arc<Law>, Status> {
+        let sought = self.sought(model, cuts, disc)?;
         let _turn = sought.turn().await;
         let mut computation = None;
         loop {
@@ -158,22 +170,30 @@ impl Maker {
         known: &mut Known,
         step: u64,
         model: &Arc<Model>,
-        place_m: Option<DVec3>,
+        place: Option<PressedPlace>,
         tell: &mpsc::Sender<LawUpdate>,
     ) {
         let is_other = !have_same_laws(&known.model, model);
-        let place_m = place_m.filter(|_| known.has_places || is_other);
-        let disc = place_m.map_or(known.disc, |place_m| known.disc.follow(model, place_m));
-        if is_other || disc != known.disc {
+        let place = place.filter(|_| known.has_places || is_other);
+        let cuts = self.seat.handle.status().cuts.clone();
+        let (disc, notices) = match place {
+            Some(PressedPlace { rest_m, .. }) => known.disc.follow_cut(model, &cuts, rest_m),
+            None => (known.disc, known.topology_version.is_some()),
+        };
+        let cuts = if notices { cuts } else { Cuts::default() };
+        let topology_version = notices.then(|| cuts.version());
+        if is_other || disc != known.disc || topology_version != known.topology_version {
             // The coarse law of a uniform tissue is computed in its middle.
-            let is_exact = !is_other && model.shape().is_uniform();
-            let law = if is_exact { self.exact(model, disc).await } else { self.first(model, disc).await };
+            let is_exact = !is_other && !notices && model.shape().is_uniform();
+            let law =
+                if is_exact { self.exact(model, &cuts, disc).await } else { self.first(model, &cuts, disc).await };
             let (is_coarse, has_places) = (law.as_ref().is_ok_and(|law| law.is_coarse), !is_exact || law.is_ok());
             self.say(known, is_other.then_some(step), law, tell).await;
-            *known = Known { number: known.number, model: model.clone(), disc, is_coarse, has_places };
+            let (number, model) = (known.number, model.clone());
+            *known = Known { number, model, disc, topology_version, is_coarse, has_places };
         }
         if known.is_coarse {
-            let law = self.exact(model, disc).await;
+            let law = self.exact(model, &cuts, disc).await;
             known.has_places = law.is_ok() || !model.shape().is_uniform();
             self.say(known, None, law, tell).await;
             known.is_coarse = false;
@@ -219,8 +239,10 @@ impl Computing {
         let model = tissue.borrow_and_update().1.clone();
         let maker = Maker { job_pool: job_pool.clone(), account: account.clone(), seat: seat.clone(), shape };
         let disc = Disc::in_middle(&model, radius_m);
-        let law = maker.first(&model, disc).await?;
-        let known = Known { number: FIRST, model, disc, is_coarse: law.is_coarse, has_places: true };
+        // That of the whole tissue: where the tool presses is not known yet.
+        let law = maker.first(&model, &Cuts::default(), disc).await?;
+        let is_coarse = law.is_coarse;
+        let known = Known { number: FIRST, model, disc, topology_version: None, is_coarse, has_places: true };
         Ok((law, Computing { maker, tissue, known }))
     }
 
@@ -228,16 +250,16 @@ impl Computing {
     /// returned handle is dropped. A newer tissue stops the computation for an older one.
     pub(super) fn go_on(self, laws: Arc<Laws>, tool: Option<u32>) -> (Updates, AbortOnDropHandle<()>) {
         let Computing { maker, mut tissue, mut known } = self;
-        let (tip, (place_m, mut places)) = (known.disc, watch::channel(None));
+        let (tip, (place, mut places)) = (known.disc, watch::channel(None));
         let (tell, told) = mpsc::channel(1);
         let work = async move {
             loop {
                 let (step, model) = tissue.borrow_and_update().clone();
-                let place_m = *places.borrow_and_update();
+                let place = *places.borrow_and_update();
                 let begun = Instant::now();
                 let changed = tokio::select! {
                     changed = tissue.changed() => changed,
-                    () = maker.tell(&mut known, step, &model, place_m, &tell) => {
+                    () = maker.tell(&mut known, step, &model, place, &tell) => {
                         // A tool that moves all the time takes a part of a core for its laws, not all of it.
                         let pause = (PAUSES * begun.elapsed()).min(LONGEST_PAUSE);
                         let moved = async {
@@ -259,7 +281,7 @@ impl Computing {
                 }
             }
         };
-        (Updates { told, laws, tool, tip, place_m }, AbortOnDropHandle::new(tokio::spawn(work.in_current_span())))
+        (Updates { told, laws, tool, tip, place }, AbortOnDropHandle::new(tokio::spawn(work.in_current_span())))
     }
 }
 
@@ -315,7 +337,8 @@ mod tests {
         }
 
         fn sought(&self) -> Arc<SoughtLaw> {
-            self.handle.law(&self.handle.model, Disc::in_middle(&self.handle.model, self.radius_m())).unwrap()
+            let disc = Disc::in_middle(&self.handle.model, self.radius_m());
+            self.handle.law(&self.handle.model, &Cuts::default(), disc).unwrap()
         }
 
         /// Changes the tissue, and returns the step from which the change takes effect.

@@ -764,7 +764,9 @@ async fn a_tip_touches_a_mesh_by_the_law_of_the_place_where_it_is() {
     for (begin, outward) in [(1, -DVec3::Z), (1_000_001, DVec3::new(0.6, -0.8, 0.0))] {
         let nearest = scene.shape().nearest(0.05 * outward);
         let disc = Disc { radius_m: tip.radius_m, at_m: scene.shape().rest_m(nearest) };
-        let expected = force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap();
+        let expected =
+            force_law::exact_within(&model, &palpate_tissue::Cuts::default(), disc, u64::MAX, &AtomicBool::new(false))
+                .unwrap();
         let (mut is_told, mut felt_n, mut step) = (false, DVec3::ZERO, 0_u32);
         tokio::time::timeout(Duration::from_secs(60), async {
             while !(is_told && felt_n.length() > 0.01) {

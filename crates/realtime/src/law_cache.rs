@@ -1,5 +1,6 @@
 //! The force laws of a session's tissue, one per radius and place of a tip. A force law is the curve of force over
-//! depth under a tip. Each is computed once for all callers. A change of the tissue's material discards them.
+//! depth under a tip. Each is computed once for all callers. A change of the tissue's material discards them; those near a cut are
+//! discarded when anything more is severed.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -9,10 +10,10 @@ use tokio::sync::MutexGuard;
 use palpate_haptics::Law;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::budget::{Account, Purpose, Resource, Taken};
-use palpate_tissue::Model;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::response::force_law::{self, Computation, Disc, LawProgress};
+use palpate_tissue::{Cuts, Model};
 
 /// Limit of the laws that a session keeps: enough for a stroke about a corner of a sheet, and back.
 const MAX_LAWS: usize = 64;
@@ -44,14 +45,21 @@ pub fn have_same_laws(a: &Model, b: &Model) -> bool {
 }
 
 impl LawCache {
-    /// Returns the law of `model` under a disc, and creates it if it is not kept; nothing is computed. At most
+    /// Returns the law of `model` with `cuts` (none for a disc that does not notice any) under a disc, and creates it if it is not kept; nothing is computed. At most
     /// `most_work` (springs times iterations) may be spent on the exact law, if this call creates it. If `model` has
     /// other laws than the tissue whose laws are kept, those are discarded first. The memory is charged to `payer`.
     ///
     /// # Errors
     /// Refuses if the memory exceeds the part of `payer` or of the system. The least recently requested law may be
     /// gone then.
-    pub fn of(&self, disc: Disc, model: &Arc<Model>, most_work: u64, payer: &Account) -> Result<Arc<SoughtLaw>> {
+    pub fn of(
+        &self,
+        disc: Disc,
+        model: &Arc<Model>,
+        cuts: &Cuts,
+        most_work: u64,
+        payer: &Account,
+    ) -> Result<Arc<SoughtLaw>> {
         let mut kept = lock(&self.0);
         let kept = match &mut *kept {
             Some(kept) if have_same_laws(&kept.model, model) => kept,
@@ -62,7 +70,10 @@ impl LawCache {
                 other.insert(TissueLaws { model: model.clone(), laws: Vec::new(), taken })
             }
         };
-        if let Some(known) = kept.laws.iter().position(|law| law.disc == disc) {
+        // A law of earlier cuts keeps their list.
+        kept.laws.retain(|law| law.cuts.is_empty() || cuts.is_empty() || law.cuts.version() == cuts.version());
+        let is_same = |law: &Arc<SoughtLaw>| law.disc == disc && law.cuts.version() == cuts.version();
+        if let Some(known) = kept.laws.iter().position(is_same) {
             // The newest is the last.
             kept.laws[known..].rotate_left(1);
             return Ok(kept.laws[kept.laws.len() - 1].clone());
@@ -72,14 +83,15 @@ impl LawCache {
         }
         kept.taken.grow_to(kept.model.bytes() + (kept.laws.len() as u64 + 1) * LAW_BYTES, "device")?;
         let (coarse, exact, turn) = (OnceLock::new(), OnceLock::new(), tokio::sync::Mutex::default());
-        let law = Arc::new(SoughtLaw { disc, model: kept.model.clone(), most_work, coarse, exact, turn });
+        let (model, cuts) = (kept.model.clone(), cuts.clone());
+        let law = Arc::new(SoughtLaw { disc, model, cuts, most_work, coarse, exact, turn });
         kept.laws.push(law.clone());
         Ok(law)
     }
 }
 
 impl LawCache {
-    /// Returns the laws of `model` that have been computed so far, exact ones where available; the most recently
+    /// Returns the laws of `model` without cuts that have been computed so far, exact ones where available; the most recently
     /// requested is the last. Empty if another tissue's laws are kept.
     pub fn known(&self, model: &Model) -> Vec<(Disc, Arc<Law>)> {
         let kept = lock(&self.0);
@@ -88,7 +100,9 @@ impl LawCache {
             let exact = law.exact.get().and_then(|exact| exact.as_ref().ok());
             Some((law.disc, exact.or(law.coarse.get())?.clone()))
         };
-        kept.map_or_else(Vec::new, |kept| kept.laws.iter().filter_map(known).collect())
+        kept.map_or_else(Vec::new, |kept| {
+            kept.laws.iter().filter(|law| law.cuts.is_empty()).filter_map(known).collect()
+        })
     }
 }
 
@@ -98,6 +112,7 @@ impl LawCache {
 pub struct SoughtLaw {
     disc: Disc,
     model: Arc<Model>,
+    cuts: Cuts,
     most_work: u64,
     coarse: OnceLock<Arc<Law>>,
     /// The exact law, or why it can't be computed.
@@ -139,9 +154,9 @@ impl SoughtLaw {
             return Ok(law.clone());
         }
         let law = memory::attempt("device", || {
-            let law = force_law::first(&self.model, self.disc, stop);
+            let law = force_law::first(&self.model, &self.cuts, self.disc, stop);
             // Hardly any tissue lacks a coarse law; then the exact one is worth its time.
-            Ok(law.or_else(|| force_law::exact_within(&self.model, self.disc, self.most_work, stop)))
+            Ok(law.or_else(|| force_law::exact_within(&self.model, &self.cuts, self.disc, self.most_work, stop)))
         });
         match law?.map(Arc::new) {
             Some(law) if law.is_coarse => Ok(self.coarse.get_or_init(|| law).clone()),
@@ -170,7 +185,8 @@ impl SoughtLaw {
     /// ([`Self::turn`]) while you call it.
     pub fn advance(&self, computation: Option<Computation>, stop: &AtomicBool) -> Option<Computation> {
         let progress = memory::attempt("law", || {
-            let computation = computation.or_else(|| Computation::new(&self.model, self.disc, self.most_work));
+            let begun = || Computation::new(&self.model, &self.cuts, self.disc, self.most_work);
+            let computation = computation.or_else(begun);
             Ok(computation.map_or(LawProgress::GivenUp, |computation| computation.advance(&self.model, stop)))
         });
         match progress {
@@ -215,7 +231,8 @@ mod tests {
         let budget = Budget::new(&Limits { memory_bytes: 256 << 10, ..Limits::default() }, 1, 1);
         let (account, kept) = (budget.account("one"), LawCache::default());
         let disc = |radius_m: f64| Disc { radius_m, at_m: DVec3::ZERO };
-        let of = |radius: u32, model: &Arc<Model>| kept.of(disc(f64::from(radius)), model, 1, &account);
+        let whole = Cuts::default();
+        let of = |radius: u32, model: &Arc<Model>| kept.of(disc(f64::from(radius)), model, &whole, 1, &account);
         let taken = || budget.bytes_for(Purpose::Laws);
         let first = of(1, &soft).unwrap();
         assert_eq!(taken(), soft.bytes() + LAW_BYTES);

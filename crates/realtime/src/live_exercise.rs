@@ -11,9 +11,9 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::budget::Account;
 use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::measured_run::{EndedExercise, MomentFigures};
-use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::{Cuts, Model};
 
 /// The most advice that a session has.
 pub const MAX_ADVICE: usize = 64;
@@ -106,8 +106,8 @@ impl LiveExercise {
     ///
     /// # Errors
     /// Refuses if the memory of a further law exceeds the part of `payer` or of the system.
-    pub fn plain_law(&self, disc: Disc, limits: &Limits, payer: &Account) -> Result<Arc<SoughtLaw>> {
-        self.plain_laws.of(disc, &self.plain, limits.law_work, payer)
+    pub fn plain_law(&self, cuts: &Cuts, disc: Disc, limits: &Limits, payer: &Account) -> Result<Arc<SoughtLaw>> {
+        self.plain_laws.of(disc, &self.plain, cuts, limits.law_work, payer)
     }
 
     /// Tells the trainee a text, with a marker at a place or without one. Both must have been checked.

@@ -32,7 +32,6 @@ use palpate_session::rules::{Commands, Rules};
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::sample_selection::{HEARTBEAT_S, Sampler, Sampling};
 use palpate_session::surface::Skin;
-use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
@@ -40,6 +39,7 @@ use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::scene::Change;
 use palpate_tissue::scene::record::{Point, ToolRecord};
 use palpate_tissue::shape::PointId;
+use palpate_tissue::{Cuts, Model};
 
 /// Handle of a session for the server's calls, which any thread may use. Its stepping thread owns the session
 /// itself.
@@ -472,13 +472,13 @@ impl SessionHandle {
         self.tissue.subscribe()
     }
 
-    /// Returns the force law of `model`, a tissue of this session, under a disc, with up to `limits.law_work` for the
+    /// Returns the force law of `model`, a tissue of this session, with these cuts under a disc, with up to `limits.law_work` for the
     /// exact one. It computes nothing; see [`SoughtLaw`].
     ///
     /// # Errors
     /// Refuses if the memory of a further law exceeds the part of the session's owner or of the system.
-    pub fn law(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>> {
-        self.laws.of(disc, model, self.limits.law_work, &self.owner)
+    pub fn law(&self, model: &Arc<Model>, cuts: &Cuts, disc: Disc) -> Result<Arc<SoughtLaw>> {
+        self.laws.of(disc, model, cuts, self.limits.law_work, &self.owner)
     }
 
     /// Returns the force law of the tissue without what the session's exercise hides, as [`SessionHandle::law`] does.
@@ -486,8 +486,8 @@ impl SessionHandle {
     /// # Errors
     /// Refuses a session without an exercise, and if the memory of a further law exceeds the part of the session's owner or of the
     /// system.
-    pub fn plain_law(&self, disc: Disc) -> Result<Arc<SoughtLaw>> {
-        self.live_exercise()?.plain_law(disc, &self.limits, &self.owner)
+    pub fn plain_law(&self, cuts: &Cuts, disc: Disc) -> Result<Arc<SoughtLaw>> {
+        self.live_exercise()?.plain_law(cuts, disc, &self.limits, &self.owner)
     }
 
     /// Returns the force laws of the present tissue that have been computed so far, each with its disc; the most
@@ -502,7 +502,7 @@ impl SessionHandle {
     pub fn adopt_laws(&self, known: Vec<(Disc, Law)>) {
         let model = self.tissue.borrow().1.clone();
         for (disc, law) in known {
-            if let Ok(sought) = self.law(&model, disc) {
+            if let Ok(sought) = self.law(&model, &Cuts::default(), disc) {
                 sought.add_known(law);
             }
         }

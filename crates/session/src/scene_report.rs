@@ -7,7 +7,6 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use palpate_haptics::{Coupling, Law, Tip, TipShape};
 
-use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::response::mesh_error::MeshErrorEstimate;
 use palpate_tissue::scene::BodyKind;
@@ -15,6 +14,7 @@ use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthPro
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::scheme::Relaxation;
 use palpate_tissue::shape::{Deepest, Extent, RestShape};
+use palpate_tissue::{Cuts, Model};
 
 /// Bounds of plausible values. Beyond them a unit is probably wrong.
 const LONGEST_SIDE_M: f64 = 10.0;
@@ -110,7 +110,8 @@ impl Laws<'_> {
     fn under(&mut self, disc: Disc) -> Option<&Law> {
         let known = self.known.iter().position(|known| known.0 == disc);
         let place = known.unwrap_or_else(|| {
-            let law = force_law::first(self.model, disc, &AtomicBool::new(false)).filter(Law::is_sound);
+            let law =
+                force_law::first(self.model, &Cuts::default(), disc, &AtomicBool::new(false)).filter(Law::is_sound);
             self.known.push((disc, law));
             self.known.len() - 1
         });

@@ -169,9 +169,9 @@ async fn until_felt(server: &TestServer, session_id: &str, what: &str, is_wanted
     }
 }
 
-/// Leads the knife of a stream along y through the tissue, and out.
-async fn cut(touch: &TestTouch, from_m: DVec3, length_m: f64) {
-    let poses = 80;
+/// Leads the knife of a stream along y through the tissue, and out, by 81 commands from `sequence` + 1 on.
+pub(super) async fn cut(touch: &TestTouch, sequence: u64, from_m: DVec3, length_m: f64) {
+    let poses = 80_u32;
     for number in 0..=poses {
         let is_out = number == poses;
         let along_m = length_m * f64::from(number) / f64::from(poses) * DVec3::Y;
@@ -181,7 +181,7 @@ async fn cut(touch: &TestTouch, from_m: DVec3, length_m: f64) {
             jaw_rad: 0.0,
         };
         let action = Some(Action::Instrument(instrument::pose(&pose)));
-        let sequence = Some(number as u64 + 1);
+        let sequence = Some(sequence + u64::from(number) + 1);
         touch.command(pb::Command { tool: 2, sequence, action, ..Default::default() }).await;
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
@@ -202,7 +202,7 @@ async fn a_copy_is_cut(scene: &str, wound_m: DVec3, length_m: f64, press_m: DVec
     assert_eq!(began.began_with, Some(Vec::new()));
     let with_knife = pb::TouchOpen { instruments: vec![instrument::instrument(&knife(), 2)], ..open(&session, &[2]) };
     let mut touch = TestTouch::open(&server, with_knife).await.unwrap();
-    cut(&touch, wound_m, length_m).await;
+    cut(&touch, 0, wound_m, length_m).await;
     let release = Some(Action::Release(pb::Release {}));
     touch.command(pb::Command { tool: 2, sequence: Some(1000), action: release, ..Default::default() }).await;
     touch.settle().await;

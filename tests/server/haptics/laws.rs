@@ -4,16 +4,18 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use super::blades::knife;
+use super::copies::cut;
 use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, open};
 use crate::common::{model, scene_with};
 use glam::DVec3;
 use palpate_haptics::force_law::{Law, Row};
-use palpate_haptics::{ContactState, Device, Touching};
-use palpate_proto::{pb, touch};
+use palpate_haptics::{ContactState, Device, Instrument, Tip, Touching};
+use palpate_proto::{instrument, pb, touch};
 use palpate_session::wire;
-use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::scene::BUILT_IN;
+use palpate_tissue::{Cuts, Model};
 use pb::touch_response::Message as Heard;
 
 /// The number of the law that a sample's local model names, if it has a model. Server and client mean the same: under
@@ -59,7 +61,7 @@ fn a_first_law_is_within_a_tenth_of_the_exact_one() {
     ];
     for (name, sets) in cases {
         let model = tissue(name, sets);
-        let first = force_law::first(&model, Disc::in_middle(&model, 0.005), &never).unwrap();
+        let first = force_law::first(&model, &Cuts::default(), Disc::in_middle(&model, 0.005), &never).unwrap();
         let [force, of_largest, stiffness] = apart(&force_law::exact(&model, 0.005), &first);
         println!(
             "{name} {sets:?}: coarse {}, force {force:.4} ({of_largest:.4} of the largest), stiffness {stiffness:.4} apart",
@@ -87,12 +89,12 @@ fn every_tissue_has_a_first_law() {
     ];
     for (name, sets, radius_m) in cases {
         let model = tissue(name, sets);
-        let first = force_law::first(&model, Disc::in_middle(&model, radius_m), &never);
+        let first = force_law::first(&model, &Cuts::default(), Disc::in_middle(&model, radius_m), &never);
         assert!(first.as_ref().is_some_and(Law::is_sound), "{name} {sets:?}: {first:?}");
     }
     let stopped = AtomicBool::new(true);
     let liver = tissue("liver", &[]);
-    assert_eq!(force_law::first(&liver, Disc::in_middle(&liver, 0.005), &stopped), None);
+    assert_eq!(force_law::first(&liver, &Cuts::default(), Disc::in_middle(&liver, 0.005), &stopped), None);
 }
 
 /// Leads tool 0 of a stream by the client's clock.
@@ -267,8 +269,9 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
     let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
     let at_rim = in_middle.follow(&model, DVec3::new(0.005, 0.0375, 0.0));
-    let [middle, rim] = [in_middle, at_rim]
-        .map(|disc| force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap());
+    let [middle, rim] = [in_middle, at_rim].map(|disc| {
+        force_law::exact_within(&model, &Cuts::default(), disc, u64::MAX, &AtomicBool::new(false)).unwrap()
+    });
     // The middle, a place that is as the middle, one radius from the fixed rim, and a place with that distance
     // elsewhere. The tool is above them: the law comes before it touches.
     let course = [(0.0375, 0.0375, &middle), (0.03, 0.045, &middle), (0.005, 0.0375, &rim), (0.045, 0.07, &rim)];
@@ -297,4 +300,67 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
         // The coarse one and the exact one of the middle. Places between the middle and the rim may have others.
         assert!(at > 1 || laws.len() == 2, "{} laws", laws.len());
     }
+}
+
+#[tokio::test]
+async fn a_tool_over_a_wound_gets_the_law_of_the_tissue_as_it_is_cut() {
+    let server = limited("");
+    let scene = scene_with(BUILT_IN.iter().find(|scene| scene.0 == "fibrotic").unwrap().1, &[]);
+    let source = pb::create_session_request::Source::Scene(wire::scene::scene(&scene));
+    let session = server.create(source, false).await.unwrap().session_id;
+    let model = model(&scene);
+    let mut touch = TestTouch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
+    let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
+    let at_m = DVec3::new(0.0395, 0.0375, 0.0);
+    let disc = Disc { radius_m: 0.005, at_m };
+    let law = |cuts: &Cuts, disc: Disc| {
+        force_law::exact_within(&model, cuts, disc, u64::MAX, &AtomicBool::new(false)).unwrap()
+    };
+    let whole = law(&Cuts::default(), Disc::in_middle(&model, 0.005).follow(&model, at_m));
+    let with_knife = pb::TouchOpen { instruments: vec![instrument::instrument(&knife(), 2)], ..open(&session, &[2]) };
+    let mut knife = TestTouch::open(&server, with_knife).await.unwrap();
+    let mut expected = whole.clone();
+    for cuts in 0..3_u32 {
+        let mut named = 0_u32;
+        tokio::time::timeout(10 * TEST_TIMEOUT, async {
+            while named < 20 {
+                // Above the tissue: the law comes before it touches.
+                lead.lead(at_m + 0.002 * DVec3::Z).await;
+                match lead.touch.hear().await.unwrap().unwrap() {
+                    Heard::ForceLaw(update) => {
+                        let told = update.law.unwrap();
+                        assert_eq!((told.number as usize, update.tissue_step), (laws.len(), None));
+                        laws.push(touch::from_law(&told).unwrap());
+                    }
+                    Heard::Sample(sample) => {
+                        named += u32::from(law_of(&sample, &laws).is_some_and(|of_model| laws[of_model] == expected));
+                    }
+                    _ => {}
+                }
+            }
+        })
+        .await
+        .unwrap_or_else(|_| panic!("{cuts} cuts: {named} models named their law, of {}", laws.len()));
+        if cuts == 2 {
+            break;
+        }
+        // From one side to the middle, and on to the other.
+        let from_m = DVec3::new(0.03625, 0.02 + 0.0175 * f64::from(cuts), -0.005);
+        cut(&knife, 100 * u64::from(cuts), from_m, 0.0175).await;
+        knife.settle().await;
+        let sequence = 100 * (u64::from(cuts) + 1) - 1;
+        let release = Some(pb::command::Action::Release(pb::Release {}));
+        knife.command(pb::Command { tool: 2, sequence: Some(sequence), action: release, ..Default::default() }).await;
+        knife.sample_with(|sample| sample.tools.iter().any(|tool| tool.acknowledged_sequence == sequence)).await;
+        let parts =
+            server.sessions().await.save_snapshot(pb::SaveSnapshotRequest { session_id: session.clone() }).await;
+        let bytes = palpate_client::snapshot::collect(parts.unwrap().into_inner()).await.unwrap();
+        let tip = Tip { radius_m: 0.005, ..Tip::default() };
+        let copy = palpate_session::journal::replay::tissue_copy(&bytes, &Instrument::of_tip(tip)).unwrap();
+        let before = expected.clone();
+        expected = law(&copy.cuts(), disc);
+        assert!(apart(&expected, &before)[1] > 0.02, "{cuts}: {:?}", apart(&expected, &before));
+    }
+    assert!(apart(&expected, &whole)[1] > 0.05, "{:?}", apart(&expected, &whole));
 }

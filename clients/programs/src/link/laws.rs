@@ -4,8 +4,8 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use palpate_haptics::{Law, TipShape};
-use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
+use palpate_tissue::{Cuts, Model};
 
 /// The laws of one tissue.
 #[derive(Debug)]
@@ -27,7 +27,7 @@ impl PlaceLaws {
         if let Some((_, law)) = known.iter().find(|known| known.0 == disc) {
             return Some(law.clone());
         }
-        let law = force_law::exact_within(&self.model, disc, u64::MAX, &AtomicBool::new(false));
+        let law = force_law::exact_within(&self.model, &Cuts::default(), disc, u64::MAX, &AtomicBool::new(false));
         let law = law
             .map(|law| force_law::of_tip(&self.model, law, self.shape, disc.radius_m))
             .filter(Law::is_sound)

@@ -119,14 +119,6 @@ impl Footprint {
         }
     }
 
-    /// Returns the disc on the tissue without cuts.
-    pub(crate) fn without_cuts(mut self, model: &Model) -> Self {
-        if self.copies.take().is_some() {
-            self.lay(model);
-        }
-        self
-    }
-
     /// Returns the corner of a solid of which a place in memory has a copy; the place itself for any other.
     pub(crate) fn corner_of(&self, index: usize) -> usize {
         self.copies.as_ref().map_or(index, |copies| copies.corner_of(index))

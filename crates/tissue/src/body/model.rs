@@ -6,6 +6,7 @@ use glam::DVec3;
 
 use crate::body::MemoryLayout;
 use crate::body::Places;
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::kernel::field::{BLOCK, Layout, State};
 use crate::kernel::real::Real;
 use crate::scene::graph::GraphFault;
@@ -302,13 +303,17 @@ impl Model {
     }
 
     /// Returns the stiffness that pulls the point at a place in memory back to where it rests, whatever its neighbours do: that of its anchor
-    /// spring, or of a foundation, N/m.
-    pub(crate) fn own_stiffness_n_per_m(&self, index: usize) -> f64 {
+    /// spring, or of a foundation, N/m. The place may be one of these copies of a solid's corners.
+    pub(crate) fn own_stiffness_n_per_m(&self, index: usize, copies: Option<&CornerCopies>) -> f64 {
+        let corner = copies.map_or(index, |copies| copies.corner_of(index));
         let by_foundation = match &self.places {
-            Places::Solid(places) => places.foundation_n_per_m * places.bed(index) * places.mass(index),
+            Places::Solid(places) => {
+                let mass = copies.map_or_else(|| places.mass(index), |copies| copies.mass(places, index));
+                places.foundation_n_per_m * places.bed(corner) * mass
+            }
             Places::Sheet(_) | Places::Surface(_) => 0.0,
         };
-        self.scene.anchor_stiffness_n_per_m * self.relative_anchor_stiffness_at(index) + by_foundation
+        self.scene.anchor_stiffness_n_per_m * self.relative_anchor_stiffness_at(corner) + by_foundation
     }
 
     /// Returns whether the point at a place in memory has an anchor spring that may be severed. (A change of the tissue may have set all K″

@@ -9,6 +9,7 @@
 use std::ops::Deref;
 use std::sync::Arc;
 
+use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::body::model::Model;
@@ -130,6 +131,12 @@ impl Cuts {
         })
     }
 
+    /// Returns whether a severed spring rests within a distance of a place, m: its first end, in a solid the lower of the two cubes.
+    pub(crate) fn are_near(&self, model: &Model, place_m: DVec3, within_m: f64) -> bool {
+        let rest_m = |spring: &SeveredSpring| model.end_at_rest_m(spring.ends[0] as usize);
+        self.springs.iter().any(|spring| rest_m(spring).distance(place_m) <= within_m)
+    }
+
     /// Returns the number of parts into which the severed springs divide the tissue: 1 for one that is whole. Points that the model
     /// joins to no other do not count. Looks at all springs. `model` is that of the tissue.
     #[allow(clippy::cast_possible_truncation)]
@@ -244,11 +251,11 @@ impl Cuts {
 }
 
 impl Model {
-    /// Returns the memory that severed springs of a session may take, bytes: four lists of all springs (its own, the
-    /// guard's checkpoint's, the one that others read, and the one whose surface was shown last), and their marks. Sheets and surfaces have no more springs
+    /// Returns the memory that severed springs of a session may take, bytes: five lists of all springs (its own, the
+    /// guard's checkpoint's, the one that others read, the one whose surface was shown last, and that of force laws), and their marks. Sheets and surfaces have no more springs
     /// to sever; in a solid the doubled corners come from the spare places of a state.
     pub fn cut_bytes(&self) -> u64 {
-        const LISTS: u64 = 4;
+        const LISTS: u64 = 5;
         let anchors = if self.scene.cutting.anchor_depth_m.is_some() { self.place_count() as u64 } else { 0 };
         let (springs, ends) = (self.end_count() as u64 / 2 + anchors, self.end_count() as u64 + anchors);
         LISTS * springs * size_of::<SeveredSpring>() as u64 + ends / 8

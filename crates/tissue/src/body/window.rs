@@ -6,6 +6,8 @@ use crate::body::Places;
 use crate::body::elements::{Elements, Spring};
 use crate::body::footprint::Footprint;
 use crate::body::model::Model;
+use crate::body::severed::Cuts;
+use crate::body::solid::corner_copies::CornerCopies;
 use crate::body::solid::linear_cells::LinearCells;
 use crate::scheme::Relaxation;
 
@@ -27,11 +29,21 @@ pub enum Window {
         /// Number of rows and of columns.
         size: [usize; 2],
     },
-    /// A ball of a mesh, as places in memory, ascending.
+    /// A ball of a mesh, as places in memory, ascending; those of copies of a solid's corners are the last.
     Ball(Vec<usize>),
 }
 
 impl Window {
+    /// Returns this window with the copies of its corners that cuts have made in a solid.
+    pub(crate) fn with_copies(mut self, cuts: &Cuts) -> Self {
+        if let (Window::Ball(places), Some(copies)) = (&mut self, cuts.copies()) {
+            let of_window = copies.places().filter(|copy| places.binary_search(&copies.corner_of(*copy)).is_ok());
+            let of_window: Vec<usize> = of_window.collect();
+            places.extend(of_window);
+        }
+        self
+    }
+
     /// Returns the window around a footprint on `model`: all points within [`half_window_m`] of the disc's middle, on
     /// a sheet in both directions, on a mesh in space. Without anchor springs these are all points.
     pub fn around(model: &Model, footprint: &Footprint) -> Self {
@@ -129,8 +141,9 @@ impl Window {
 
     /// Returns which of the points can move. Points at the border, whose springs lead out of the window, are
     /// held.
-    pub(crate) fn free(&self, model: &Model) -> Vec<bool> {
-        let is_fixed = |index: usize| model.fixed.binary_search(&index).is_ok();
+    pub(crate) fn free(&self, model: &Model, copies: Option<&CornerCopies>) -> Vec<bool> {
+        let corner_of = |index: usize| copies.map_or(index, |copies| copies.corner_of(index));
+        let is_fixed = |index: usize| model.fixed.binary_search(&corner_of(index)).is_ok();
         match self {
             Window::Ball(slots) => {
                 let is_within = |slot: usize| slots.binary_search(&slot).is_ok();
@@ -151,10 +164,16 @@ impl Window {
     }
 
     /// Returns what joins points of the window, at least one of which is `free`. Rest vectors are turned by `turn`.
-    pub(crate) fn elements(&self, model: &Model, free: &[bool], turn: &DMat3) -> Elements {
+    pub(crate) fn elements(
+        &self,
+        model: &Model,
+        free: &[bool],
+        turn: &DMat3,
+        copies: Option<&CornerCopies>,
+    ) -> Elements {
         if let (Places::Solid(places), Window::Ball(part)) = (&model.places, self) {
             let stiffness_n_per_m = model.scene.springs.stiffness_n_per_m;
-            return Elements::Cells(LinearCells::of(places, part, stiffness_n_per_m, model.unit_m, turn));
+            return Elements::Cells(LinearCells::of(places, copies, part, stiffness_n_per_m, model.unit_m, turn));
         }
         let mut springs = match self {
             Window::Ball(slots) => of_mesh(model, slots, free),

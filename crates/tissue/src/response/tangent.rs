@@ -13,6 +13,9 @@
 //! and Stiefel, Journal of Research of the National Bureau of Standards 49(6), 1952, doi:10.6028/jres.049.044),
 //! all systems side by side, preconditioned by the points' own blocks. Points too far away to notice are
 //! held: a press reaches √(k/K″) spacings.
+//!
+//! A tissue with cuts is pressed as it is: without the severed springs, with the copies of a solid's corners, and gaping if it has a
+//! pretension.
 
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,7 +24,7 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::body::MemoryLayout;
 use crate::body::elements::Elements;
-use crate::body::footprint::{Footprint, WeightedNode};
+use crate::body::footprint::{Footprint, WeightedNode, mass_at};
 use crate::body::model::Model;
 use crate::body::severed::Cuts;
 use crate::body::window::Window;
@@ -99,6 +102,8 @@ pub struct LinearPatch<'m> {
     /// What pulls each point back to where it rests, N/m.
     own_n_per_m: Vec<f64>,
     elements: Elements,
+    /// The loads that severed springs have left on points, N: the tissue at rest is not where it is without cuts.
+    loads_n: Vec<(usize, DVec3)>,
     pressure: Option<SharedPressure>,
     inverses: Vec<DMat3>,
     accuracy: Accuracy,
@@ -170,6 +175,7 @@ impl<'m> LinearPatch<'m> {
     /// Displacements and results are in directions turned by `turn`.
     fn turned(
         model: &'m Model,
+        cuts: &Cuts,
         footprint: &Footprint,
         window: Window,
         displacement_m: Vec<DVec3>,
@@ -181,15 +187,23 @@ impl<'m> LinearPatch<'m> {
                 weights[at] = weight;
             }
         }
-        Self::weighted(model, weights, window, displacement_m, turn)
+        Self::weighted(model, cuts, weights, window, displacement_m, turn)
     }
 
     /// Creates the patch of a window with given weights of the points. Directions are turned by `turn`.
-    fn weighted(model: &'m Model, weights: Vec<f64>, window: Window, displacement_m: Vec<DVec3>, turn: &DMat3) -> Self {
-        let free = window.free(model);
-        let elements = window.elements(model, &free, turn);
-        let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();
-        let own_n_per_m = window.points(model).map(|index| model.own_stiffness_n_per_m(index)).collect();
+    fn weighted(
+        model: &'m Model,
+        cuts: &Cuts,
+        weights: Vec<f64>,
+        window: Window,
+        displacement_m: Vec<DVec3>,
+        turn: &DMat3,
+    ) -> Self {
+        let copies = cuts.copies().map(|copies| &**copies);
+        let free = window.free(model, copies);
+        let elements = window.elements(model, &free, turn, copies);
+        let masses = window.points(model).map(|index| mass_at(model, copies, index)).collect();
+        let own_n_per_m = window.points(model).map(|index| model.own_stiffness_n_per_m(index, copies)).collect();
         let mut patch = LinearPatch {
             model,
             pressure: SharedPressure::of(model, &window, &free, turn),
@@ -200,46 +214,62 @@ impl<'m> LinearPatch<'m> {
             masses,
             own_n_per_m,
             elements,
+            loads_n: Vec::new(),
             inverses: Vec::new(),
             accuracy: Accuracy::EXACT,
             allowance: Allowance::default(),
         };
+        patch.sever(cuts, turn);
         patch.linearise();
         patch
     }
 
-    /// Creates the patch of a window around a footprint on `model`, and linearises it. `displacement_m` has the
+    /// Creates the patch of a window around a footprint on `model` with these cuts, and linearises it. `displacement_m` has the
     /// displacement from rest of each point of the window, m, in the order of [`Window::points`]. Panics if it is
     /// shorter.
-    pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
-        Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
+    pub fn new(
+        model: &'m Model,
+        cuts: &Cuts,
+        footprint: &Footprint,
+        window: Window,
+        displacement_m: Vec<DVec3>,
+    ) -> Self {
+        Self::turned(model, cuts, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
 
-    /// Takes the severed springs away, anchor springs too, of a patch in the tissue's own directions; of a solid, the cubes with doubled corners, which are on
-    /// one side of a cut.
-    pub(crate) fn without(mut self, cuts: &Cuts) -> Self {
-        if let (Elements::Cells(cells), Some(copies)) = (&mut self.elements, cuts.copies()) {
-            cells.retain(|cube| copies.number_of(cube).is_none());
-            self.linearise();
-            return self;
+    /// Takes the severed springs away, anchor springs too. What a pretension leaves of them stays as a load on their ends. (A solid has the
+    /// copies of its corners in their place.)
+    fn sever(&mut self, cuts: &Cuts, turn: &DMat3) {
+        let model = self.model;
+        if cuts.is_empty() || model.places.solid().is_some() {
+            return;
         }
-        let within = |place: u32| self.window.find(self.model, self.model.point_of(place as usize));
-        let anchors = cuts.springs().iter().filter(|spring| spring.is_anchor());
-        let freed: Vec<usize> = anchors.filter_map(|spring| within(spring.ends[0])).collect();
-        let found = cuts.springs().iter().filter_map(|spring| {
-            let [first, second] = spring.ends;
-            let rest =
-                self.model.springs_at(first as usize).into_iter().find(|of| of.number == spring.number as usize)?.rest;
-            Some(([within(first)?, within(second)?], self.model.unit_m * rest))
-        });
-        let mut found: Vec<([usize; 2], DVec3)> = found.collect();
+        let within = |place: u32| self.window.find(model, model.point_of(place as usize));
+        let (mut found, mut freed, mut loads_n) = (Vec::new(), Vec::new(), Vec::new());
+        for severed in cuts.springs() {
+            let [first, second] = severed.ends;
+            if severed.is_anchor() {
+                freed.extend(within(first));
+                continue;
+            }
+            let at_first = model.springs_at(first as usize);
+            let Some(spring) = at_first.iter().find(|spring| spring.number == severed.number as usize) else {
+                continue;
+            };
+            let rest_m = *turn * (model.unit_m * spring.rest);
+            let ends = [within(first), within(second)];
+            if let [Some(first), Some(second)] = ends {
+                found.push(([first, second], rest_m));
+            }
+            let load_n = spring.tension_n_per_m * rest_m;
+            loads_n.extend(ends.into_iter().zip([-load_n, load_n]).filter_map(|(end, load_n)| Some((end?, load_n))));
+        }
         found.sort_unstable_by_key(|(ends, _)| *ends);
+        self.elements.remove(&found);
         freed.iter().for_each(|at| self.own_n_per_m[*at] = 0.0);
-        if !found.is_empty() || !freed.is_empty() {
-            self.elements.remove(&found);
-            self.linearise();
+        if model.prestrain != 0.0 {
+            self.loads_n = loads_n;
         }
-        self
     }
 
     /// Computes forces and tangents at the present displacements.
@@ -357,8 +387,13 @@ impl<'m> LinearPatch<'m> {
         }
     }
 
-    /// Moves the disc's z to `-depth_m` quasi-statically (Newton's method). Returns the force on the disc, N.
-    fn press(&mut self, depth_m: f64) -> f64 {
+    /// Returns the disc's z, m.
+    fn disc_m(&self) -> f64 {
+        self.displacement_m.iter().zip(&self.weights).map(|(u, weight)| weight * u.z).sum()
+    }
+
+    /// Moves the disc's z to `to_m` quasi-statically (Newton's method), or lets it go (`None`). Returns the force on the disc, N.
+    fn press(&mut self, to_m: Option<f64>) -> f64 {
         let mut force_n = 0.0;
         for _ in 0..MAX_NEWTON {
             let mut right: Vec<[DVec3; 2]> = self
@@ -369,6 +404,7 @@ impl<'m> LinearPatch<'m> {
                 .map(|((u, weight), own)| [-*own * *u, *weight * DVec3::Z])
                 .collect();
             self.elements.forces(|point, force_n| right[point][0] += force_n);
+            self.loads_n.iter().for_each(|(point, load_n)| right[*point][0] += *load_n);
             if let Some(pressure) = &self.pressure {
                 let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(self.displacement_m.iter());
                 for (right, area) in right.iter_mut().zip(&pressure.areas_m2) {
@@ -379,9 +415,11 @@ impl<'m> LinearPatch<'m> {
             let on_disc = |x: &dyn Fn(usize) -> f64| -> f64 {
                 self.weights.iter().enumerate().map(|(at, weight)| weight * x(at)).sum()
             };
-            let place = on_disc(&|at| self.displacement_m[at].z);
             let (free, forced) = (on_disc(&|at| x[at][0].z), on_disc(&|at| x[at][1].z));
-            let applied_n = if forced > 0.0 { (-depth_m - place - free) / forced } else { 0.0 };
+            let applied_n = match to_m {
+                Some(to_m) if forced > 0.0 => (to_m - self.disc_m() - free) / forced,
+                _ => 0.0,
+            };
             force_n = -applied_n;
             let mut largest_m: f64 = 0.0;
             for (u, x) in self.displacement_m.iter_mut().zip(&x) {
@@ -408,7 +446,8 @@ pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
     let Some(volume) = model.places.volume() else { return Vec::new() };
     let (window, unit_m2) = (Window::all(model), model.unit_m * model.unit_m);
     let zero = vec![DVec3::ZERO; window.len()];
-    let patch = LinearPatch::weighted(model, vec![0.0; window.len()], window, zero, &DMat3::IDENTITY);
+    let whole = Cuts::default();
+    let patch = LinearPatch::weighted(model, &whole, vec![0.0; window.len()], window, zero, &DMat3::IDENTITY);
     let patch = LinearPatch { pressure: None, allowance: Allowance::of(YIELDING, stop), ..patch };
     let area_m2 = |slot: usize| volume.areas[slot] * unit_m2;
     let pushed: Vec<[DVec3; 1]> = (0..model.len()).map(|slot| [area_m2(slot)]).collect();
@@ -473,6 +512,7 @@ pub struct Course {
 /// the displacements at the last depth, from which the next one starts.
 #[derive(Debug)]
 pub struct Press {
+    cuts: Cuts,
     footprint: Footprint,
     window: Window,
     /// Rotates the outward normal under the disc to z.
@@ -482,6 +522,8 @@ pub struct Press {
     /// Springs times iterations that may still be computed.
     left: u64,
     displacement_m: Vec<DVec3>,
+    /// Where the disc is without a force, m: not at 0 if the tissue gapes.
+    begins_m: f64,
     pressed: Vec<Pressed>,
 }
 
@@ -497,39 +539,41 @@ pub enum Deepened {
 }
 
 impl Press {
-    /// Creates a press along `course` with unlimited work; no depth is computed yet. Unwinds with a refusal if there
+    /// Creates a press into whole tissue along `course` with unlimited work; no depth is computed yet. Unwinds with a refusal if there
     /// is no memory ([`attempt`](crate::memory::attempt)).
     pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
-        let (footprint, window) = Self::laid(model, &course);
-        Self::begun(footprint, window, course, accuracy)
+        let whole = Cuts::default();
+        let (footprint, window) = Self::laid(model, &whole, &course);
+        Self::begun(whole, footprint, window, course, accuracy)
     }
 
     /// Returns the disc at its place, and the window of points that notice it.
-    fn laid(model: &Model, course: &Course) -> (Footprint, Window) {
-        let footprint = Footprint::new(model, course.radius_m, course.centre_m);
+    fn laid(model: &Model, cuts: &Cuts, course: &Course) -> (Footprint, Window) {
+        let mut footprint = Footprint::new(model, course.radius_m, course.centre_m);
+        footprint.follow_cuts(model, cuts.copies());
         let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points, course.within_m);
-        (footprint, window)
+        (footprint, window.with_copies(cuts))
     }
 
-    fn begun(footprint: Footprint, window: Window, course: Course, accuracy: Accuracy) -> Self {
+    fn begun(cuts: Cuts, footprint: Footprint, window: Window, course: Course, accuracy: Accuracy) -> Self {
         memory::require(window.bytes(), "a force law");
         let (_, outward) = footprint.at_rest();
         let turn = DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z));
         let displacement_m = vec![DVec3::ZERO; window.len()];
         let (left, pressed) = (u64::MAX, Vec::new());
-        Press { footprint, window, turn, course, accuracy, left, displacement_m, pressed }
+        Press { cuts, footprint, window, turn, course, accuracy, left, displacement_m, begins_m: 0.0, pressed }
     }
 
-    /// Creates a press along `course` with at most `work` springs times iterations for all depths. `None` if they
+    /// Creates a press into a tissue with these cuts along `course`, with at most `work` springs times iterations for all depths. `None` if they
     /// can't suffice (an estimate from the number of points and depths). Unwinds with a refusal if there is no memory.
-    pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
+    pub fn within(model: &Model, cuts: &Cuts, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
         // A solution takes about as many iterations as there are points from the middle to where nothing is
         // noticed, and each depth some solutions. A press that can't be completed is not begun, and takes no
         // memory.
-        let (footprint, window) = Self::laid(model, &course);
+        let (footprint, window) = Self::laid(model, cuts, &course);
         let solved = if model.scene.body.kind().law_is_linear() { 1 } else { u64::from(course.count) };
         let least = window.len() as u64 * 4 * solved * (window.across() as u64);
-        (least <= work).then(|| Press { left: work, ..Self::begun(footprint, window, course, accuracy) })
+        (least <= work).then(|| Press { left: work, ..Self::begun(cuts.clone(), footprint, window, course, accuracy) })
     }
 
     /// Returns the springs times iterations that may still be computed; 0 once the press is given up.
@@ -556,9 +600,14 @@ impl Press {
             return if self.next_depth_m().is_some() { Deepened::Further } else { Deepened::Done };
         }
         let displacement_m = std::mem::take(&mut self.displacement_m);
-        let patch = LinearPatch::turned(model, &self.footprint, self.window.clone(), displacement_m, &self.turn);
+        let Press { cuts, footprint, window, turn, .. } = &*self;
+        let patch = LinearPatch::turned(model, cuts, footprint, window.clone(), displacement_m, turn);
         let mut patch = LinearPatch { accuracy: self.accuracy, allowance: Allowance::of(self.left, stop), ..patch };
-        let force_n = if depth_m > 0.0 { patch.press(depth_m) } else { 0.0 };
+        if self.pressed.is_empty() && !patch.loads_n.is_empty() {
+            patch.press(None);
+            self.begins_m = patch.disc_m();
+        }
+        let force_n = if depth_m > 0.0 { patch.press(Some(self.begins_m - depth_m)) } else { 0.0 };
         let tangent = patch.tangent();
         self.left = patch.allowance.left.get();
         if patch.allowance.is_spent() {

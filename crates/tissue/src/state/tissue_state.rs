@@ -262,17 +262,18 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn tangent_input(&self, tool: usize) -> Option<TangentInput> {
         let tool = self.contacts.tool(tool).filter(|tool| tool.contact_state != ContactState::Free)?;
-        let window = Window::around(&self.model, &tool.footprint);
+        let cuts = self.tables.severed.cuts();
+        let window = Window::around(&self.model, &tool.footprint).with_copies(cuts);
         // Without memory for it, the stiffness from the force law must suffice.
         memory::check(window.bytes(), "the stiffness under a tool").ok()?;
         let displacement_m = |place: usize| self.displacement_m(self.model.point_of(place));
         let displacement_m = window.points(&self.model).map(displacement_m).collect();
         Some(TangentInput {
             model: self.model.clone(),
-            footprint: tool.footprint.clone().without_cuts(&self.model),
+            footprint: tool.footprint.clone(),
             window,
             displacement_m,
-            cuts: self.tables.severed.cuts().clone(),
+            cuts: cuts.clone(),
         })
     }
 

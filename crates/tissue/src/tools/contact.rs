@@ -137,8 +137,7 @@ impl TangentInput {
     /// Computes stiffness, damping and drag under the tool, in the tissue's frame. Takes some milliseconds for a
     /// thousand points, all on the calling thread.
     pub fn tangent(self) -> Tangent {
-        let patch = LinearPatch::new(&self.model, &self.footprint, self.window, self.displacement_m);
-        patch.without(&self.cuts).tangent()
+        LinearPatch::new(&self.model, &self.cuts, &self.footprint, self.window, self.displacement_m).tangent()
     }
 }
 

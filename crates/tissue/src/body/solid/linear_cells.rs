@@ -9,6 +9,7 @@ use std::cell::RefCell;
 
 use glam::{DMat3, DVec3};
 
+use super::corner_copies::{CornerCopies, corners_of};
 use super::neo_hookean::{Invariants, NeoHookean, Patterns, Stress};
 use super::places::SolidPlaces;
 use crate::kernel::lanes::{self, Scalar, SingleWork};
@@ -21,7 +22,6 @@ const BEYOND: u32 = u32::MAX;
 /// A cube of the part.
 #[derive(Debug, Clone)]
 struct LinearCell {
-    cube: usize,
     /// The index of each corner among the points of the part.
     points: [u32; 8],
     weight: f64,
@@ -71,17 +71,25 @@ pub(super) fn resisting(stress: &Stress<One>) -> [DVec3; 8] {
 }
 
 impl LinearCells {
-    /// Finds the cubes with a corner among the places `part`, ascending. Directions are turned by `turn`.
+    /// Finds the cubes with a corner among the places `part`, ascending, some of which may be copies of corners. Directions are turned by
+    /// `turn`.
     #[allow(clippy::cast_possible_truncation)]
-    pub(crate) fn of(places: &SolidPlaces, part: &[usize], stiffness_n_per_m: f64, edge_m: f64, turn: &DMat3) -> Self {
-        let around = |place: &usize| [0, 1].map(|beside| places.cubes_around(*place, beside));
+    pub(crate) fn of(
+        places: &SolidPlaces,
+        copies: Option<&CornerCopies>,
+        part: &[usize],
+        stiffness_n_per_m: f64,
+        edge_m: f64,
+        turn: &DMat3,
+    ) -> Self {
+        let corner_of = |place: usize| copies.map_or(place, |copies| copies.corner_of(place));
+        let around = |place: &usize| [0, 1].map(|beside| places.cubes_around(corner_of(*place), beside));
         let mut cubes: Vec<usize> = part.iter().flat_map(around).flatten().flatten().collect();
         cubes.sort_unstable();
         cubes.dedup();
         let index = |place: usize| part.binary_search(&place).map_or(BEYOND, |at| at as u32);
         let cell = |cube: usize| LinearCell {
-            cube,
-            points: places.corners_of(cube).map(index),
+            points: corners_of(places, copies, cube).map(index),
             weight: places.weight(cube),
             cofactor: [[0.0; 3]; 3],
             h: [[0.0; 3]; 3],
@@ -96,11 +104,6 @@ impl LinearCells {
     /// Returns the number of cubes.
     pub(crate) fn len(&self) -> usize {
         self.cells.len()
-    }
-
-    /// Keeps the cubes for which `keeps` is true, by their least corners.
-    pub(crate) fn retain(&mut self, keeps: impl Fn(usize) -> bool) {
-        self.cells.retain(|cell| keeps(cell.cube));
     }
 
     /// Computes the forces and their derivative at the present displacements of the part's points, m. Adds to `blocks`

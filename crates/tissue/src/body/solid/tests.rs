@@ -272,7 +272,7 @@ fn linearised_cubes_resist_with_the_derivative_of_their_force() {
     let Places::Solid(places) = &model.places else { panic!("of another kind") };
     let part: Vec<usize> = model.points().map(|point| model.place_of(point)).collect();
     let turn = DMat3::from_axis_angle(DVec3::new(0.3, -1.0, 0.5).normalize(), 0.7);
-    let mut cells = LinearCells::of(places, &part, model.scene.springs.stiffness_n_per_m, model.unit_m, &turn);
+    let mut cells = LinearCells::of(places, None, &part, model.scene.springs.stiffness_n_per_m, model.unit_m, &turn);
     let field = |size: f64, phase: f64| -> Vec<DVec3> {
         let of = |n: usize| DVec3::new((1.7 * n as f64 + phase).sin(), (2.3 * n as f64).cos(), (0.9 * n as f64).sin());
         (0..part.len()).map(|n| size * model.unit_m * of(n)).collect()

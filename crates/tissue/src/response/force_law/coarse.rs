@@ -9,6 +9,8 @@
 //! On a mesh, it is the law of the points around the disc, as many as time allows: those beyond are held. A solid carries a
 //! load farther. There it is the law of the whole with larger cells, refined in the same way by the points around the disc
 //! with the two sizes of cells.
+//!
+//! A law near a cut is that of the points around the disc too: sheets of other points have no cuts.
 
 use std::f64::consts::PI;
 use std::sync::atomic::AtomicBool;
@@ -16,8 +18,9 @@ use std::sync::atomic::AtomicBool;
 use palpate_haptics::force_law::{Law, Row};
 
 use super::disc::Disc;
-use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
+use super::exact::{ROWS as EXACT_ROWS, course, follow};
 use crate::body::model::Model;
+use crate::body::severed::Cuts;
 use crate::body::window::half_window_m;
 use crate::response::tangent::{self, Accuracy, Course};
 
@@ -50,28 +53,31 @@ const POINTS: [(usize, u64); 3] = [(500, 650_000), (250, 200_000), (120, 0)];
 /// Distance of points, in radii of the disc, that is fine enough under the disc.
 const FINE_ENOUGH: f64 = 0.7;
 
-/// Computes the first force law of a disc, on the calling thread: the exact one if it takes little work, otherwise a
-/// coarse one ([`Law::is_coarse`]), on a uniform tissue that of its middle. `None` if that would take more than about 50 ms (0.3 s on a solid) as
+/// Computes the first force law of a disc on a tissue with these cuts, on the calling thread: the exact one if it takes little work, otherwise a
+/// coarse one ([`Law::is_coarse`]), on a uniform tissue without cuts that of its middle. `None` if that would take more than about 50 ms (0.3 s on a solid) as
 /// well, if another thread sets `stop`, or if the coarse law is not sound. Work is counted, not timed, so every
 /// machine gives the same law. Unwinds with a refusal if there is no memory ([`attempt`](crate::memory::attempt)).
-pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
+pub fn first(model: &Model, cuts: &Cuts, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     if model.scene.body.kind().law_is_linear() {
         let mut work = LINEAR_WORK;
-        let whole = pressed(model, disc, ROWS, Accuracy::COARSE, &mut work, stop);
-        if let Some(law) = whole.filter(Law::is_sound) {
+        let all = follow(model, cuts, course(disc, ROWS), Accuracy::COARSE, &mut work, stop);
+        if let Some(law) = all.filter(Law::is_sound) {
             return Some(Law { is_coarse: true, ..law });
         }
-        return of_larger_cells(model, disc, stop);
+        return of_larger_cells(model, cuts, disc, stop);
     }
     let mut work = EXACT_WORK;
-    let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
+    let exact = follow(model, cuts, course(disc, EXACT_ROWS), Accuracy::EXACT, &mut work, stop);
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
+        if model.shape().is_uniform() && !cuts.is_empty() {
+            return of_fewer_points(model, cuts, disc, usize::MAX, &mut left, stop);
+        }
         if !model.shape().is_uniform() {
             return POINTS.iter().find_map(|(points, kept)| {
                 let most = left.saturating_sub(*kept);
                 let mut work = most;
-                let law = of_fewer_points(model, disc, *points, &mut work, stop);
+                let law = of_fewer_points(model, cuts, disc, *points, &mut work, stop);
                 left -= most - work;
                 law
             });
@@ -86,26 +92,36 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     })
 }
 
-/// Computes the law of a solid with larger cells, refined around the disc by its own cells.
-fn of_larger_cells(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
+/// Computes the law of a solid with larger cells, without cuts, refined around the disc by its own cells.
+fn of_larger_cells(model: &Model, cuts: &Cuts, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let edge_m = model.shape().edge_m();
     for times in LARGER {
         let larger = model.with_cells(times * edge_m)?;
         let (whole, half_ball) = (course(disc, ROWS), (1.5 / PI * OWN_POINTS).cbrt() * edge_m);
         let around = Course { within_m: half_ball.max(disc.radius_m + 3.0 * times * edge_m), ..whole };
-        let of = |model: &Model, course: Course| follow(model, course, Accuracy::COARSE, &mut { LINEAR_WORK }, stop);
-        if let Some(law) = of(&larger, whole) {
-            let law = refined(&law, &of(model, around)?, &of(&larger, around)?);
+        let none = Cuts::default();
+        let of = |model: &Model, cuts: &Cuts, course: Course| {
+            follow(model, cuts, course, Accuracy::COARSE, &mut { LINEAR_WORK }, stop)
+        };
+        if let Some(law) = of(&larger, &none, whole) {
+            let law = refined(&law, &of(model, cuts, around)?, &of(&larger, &none, around)?);
             return law.is_sound().then_some(Law { is_coarse: true, ..law });
         }
     }
     None
 }
 
-/// Computes a law with `points` of a mesh, and subtracts its work from `work`.
-fn of_fewer_points(model: &Model, disc: Disc, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
+/// Computes a law with `points` of a mesh, or with all that notice the disc on a sheet, and subtracts its work from `work`.
+fn of_fewer_points(
+    model: &Model,
+    cuts: &Cuts,
+    disc: Disc,
+    points: usize,
+    work: &mut u64,
+    stop: &AtomicBool,
+) -> Option<Law> {
     let course = Course { points, ..course(disc, ROWS) };
-    let law = follow(model, course, Accuracy::COARSE, work, stop)?;
+    let law = follow(model, cuts, course, Accuracy::COARSE, work, stop)?;
     law.is_sound().then_some(Law { is_coarse: true, ..law })
 }
 
@@ -159,7 +175,11 @@ fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) ->
 /// Computes a coarse law from sheets with about twice `half` intervals along the longer side, and subtracts its
 /// work from `work`.
 fn coarse(model: &Model, radius_m: f64, half: u32, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
-    let mut of = |model: &Model| pressed(model, Disc::in_middle(model, radius_m), ROWS, Accuracy::COARSE, work, stop);
+    let whole = Cuts::default();
+    let mut of = |model: &Model| {
+        let course = course(Disc::in_middle(model, radius_m), ROWS);
+        follow(model, &whole, course, Accuracy::COARSE, work, stop)
+    };
     let (size_m, edge_m) = (model.shape().extent().size_m(), model.shape().edge_m());
     let half_m = half_window_m(model, radius_m).min(0.5 * model.shape().longest_side_m());
     // Choose intervals that also end at the rim of the shorter side.
@@ -212,7 +232,7 @@ mod tests {
             let anchor_stiffness = format!("anchor_springs.stiffness_n_per_m={anchor_stiffness}");
             let model = Model::paper(&["sheet.points=[25, 25]", "sheet.fixed=\"edges\"", &anchor_stiffness]);
             let radius_m = model.shape().edge_m();
-            let first = first(&model, Disc::in_middle(&model, radius_m), &never).unwrap();
+            let first = first(&model, &Cuts::default(), Disc::in_middle(&model, radius_m), &never).unwrap();
             let [force, stiffness] = apart(&exact(&model, radius_m), &first);
             println!("{anchor_stiffness}: force {force:.4}, stiffness {stiffness:.4} apart");
             assert!(first.is_coarse && first.is_sound());
@@ -234,7 +254,7 @@ mod tests {
         let shape = model.shape();
         let at_m = shape.rest_m(shape.nearest(glam::DVec3::new(0.02, 0.0, -0.05)));
         let (disc, mut work) = (Disc { radius_m: 0.006, at_m }, WORK);
-        let law = of_fewer_points(&model, disc, 250, &mut work, &AtomicBool::new(false)).unwrap();
+        let law = of_fewer_points(&model, &Cuts::default(), disc, 250, &mut work, &AtomicBool::new(false)).unwrap();
         assert!(law.is_coarse && law.is_sound() && law.at_depth(0.003).force_n > 0.0 && work < WORK);
     }
 }

@@ -3,13 +3,18 @@
 use glam::DVec3;
 
 use crate::body::window::half_window_m;
-use crate::{Model, ToolContact};
+use crate::{Cuts, Model, ToolContact};
 
 /// Distance from the surface, in radii, beyond which a tool needs no law of its place.
 const NEAR_IN_RADII: f64 = 4.0;
 
-/// Distance, in radii, up to which the law of a place serves a tool.
+/// Distance, in radii, up to which the law of a place serves a tool; and near a cut.
 const SERVES_IN_RADII: f64 = 0.5;
+const SERVES_NEAR_CUTS_IN_RADII: f64 = 0.25;
+
+/// Distance from a disc on a solid, in radii, up to which its law is that of the tissue with the cuts there: a load that falls as 1/r
+/// hardly notices others.
+const NOTICES_IN_RADII: f64 = 8.0;
 
 /// A disc that presses on a tissue, and the place at rest where it presses: that of which a force law is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,7 +49,28 @@ impl Disc {
         is_near.then_some(feel.anchor_m)
     }
 
-    /// Returns the disc whose law serves a tool that presses the tissue resting at `rest_m` (m,
+    /// Returns whether the law of this disc differs from that of the whole tissue: whether anything is severed at most half as far from its
+    /// rim as points notice a press, which is e⁻⁶ of the stiffness on anchor springs, in a solid 8 radii.
+    pub fn notices(&self, model: &Model, cuts: &Cuts) -> bool {
+        let beyond_m = 0.5 * (half_window_m(model, self.radius_m) - self.radius_m);
+        let most_m = NOTICES_IN_RADII * self.radius_m;
+        let within_m = self.radius_m + if model.places.solid().is_some() { most_m } else { beyond_m };
+        cuts.are_near(model, self.at_m, within_m)
+    }
+
+    /// Returns the disc whose law serves a tool that presses the tissue resting at `rest_m` (m, [`Disc::pressed_m`]), in a tissue with cuts,
+    /// and whether that law is of the cut tissue ([`Disc::notices`]): then the disc is at that place, or at most a quarter of a radius away.
+    #[must_use]
+    pub fn follow_cut(self, model: &Model, cuts: &Cuts, rest_m: DVec3) -> (Self, bool) {
+        let there = Disc { at_m: rest_m, ..self };
+        if !there.notices(model, cuts) {
+            return (self.follow(model, rest_m), false);
+        }
+        let is_near = rest_m.distance(self.at_m) <= SERVES_NEAR_CUTS_IN_RADII * self.radius_m;
+        (if is_near { self } else { there }, true)
+    }
+
+    /// Returns the disc whose law serves a tool that presses a whole tissue resting at `rest_m` (m,
     /// [`Disc::pressed_m`]): `self` while the representative of that place ([`representative_m`]) is at most half a radius
     /// from [`Disc::at_m`], otherwise the disc of the same radius at that representative. So a tool that moves back
     /// and forth between two near places keeps the law of the first. To be followed, [`Disc::at_m`] should be a
@@ -74,7 +100,7 @@ mod tests {
         let model = Model::paper(&["sheet.points=[21, 21]", "sheet.spacing_m=0.01", "sheet.fixed=\"edges\""]);
         let law = |at_m: DVec2| {
             let disc = Disc { radius_m: RADIUS_M, at_m: at_m.extend(0.0) };
-            exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap()
+            exact_within(&model, &Cuts::default(), disc, u64::MAX, &AtomicBool::new(false)).unwrap()
         };
         let alike = |at_m: DVec2| representative_m(&model, RADIUS_M, at_m.extend(-0.003)).truncate();
         let middle = law(DVec2::splat(0.1));

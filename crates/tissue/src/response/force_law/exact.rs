@@ -7,6 +7,7 @@ use palpate_haptics::force_law::{Law, Row};
 
 use super::disc::Disc;
 use crate::body::model::Model;
+use crate::body::severed::Cuts;
 use crate::response::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
 
 /// Rows of an exact law.
@@ -32,11 +33,12 @@ pub enum LawProgress {
 }
 
 impl Computation {
-    /// Begins the computation of the law under a disc, with at most `most_work` springs times iterations for all
+    /// Begins the computation of the law of a tissue with these cuts under a disc, with at most `most_work` springs times iterations for all
     /// depths. `None` if they can't suffice. Unwinds with a refusal if there is no memory
     /// ([`attempt`](crate::memory::attempt)).
-    pub fn new(model: &Model, disc: Disc, most_work: u64) -> Option<Self> {
-        Press::within(model, course(disc, ROWS), Accuracy::EXACT, most_work).map(|press| Computation(Box::new(press)))
+    pub fn new(model: &Model, cuts: &Cuts, disc: Disc, most_work: u64) -> Option<Self> {
+        let press = Press::within(model, cuts, course(disc, ROWS), Accuracy::EXACT, most_work)?;
+        Some(Computation(Box::new(press)))
     }
 
     /// Computes the next depth on the calling thread; given up if another thread sets `stop`. `model` must be the one
@@ -55,7 +57,7 @@ pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
     Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX, within_m: f64::INFINITY }
 }
 
-/// Computes the exact law of a disc of `radius_m` (m) in the middle of a tissue ([`Disc::in_middle`]), with unlimited
+/// Computes the exact law of a disc of `radius_m` (m) in the middle of a whole tissue ([`Disc::in_middle`]), with unlimited
 /// work. It takes some tenths of a second for a thousand points. The law has 21 rows, from 0 to four radii deep, each
 /// a solution at rest with its tangent ([`Tangent`](crate::response::tangent::Tangent): stiffness S, damping B and
 /// drag D, turned so that z is the normal). Along the normal the row has S_zz and B_zz, across it ½(S_xx + S_yy) and
@@ -81,33 +83,22 @@ pub fn exact(model: &Model, radius_m: f64) -> Law {
     from_pressed(&tangent::press(model, radius_m, centre_m, step_m, count))
 }
 
-/// Computes the exact law of a disc, of 21 rows as [`exact`] does, with at most `most_work` springs times iterations.
-/// `None` if they do not suffice, or if another thread sets `stop`. Unwinds with a refusal if there is no memory.
-pub fn exact_within(model: &Model, disc: Disc, most_work: u64, stop: &AtomicBool) -> Option<Law> {
-    pressed(model, disc, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
-}
-
-/// Computes a law with `rows` rows, and subtracts its work from `work`.
-pub(super) fn pressed(
-    model: &Model,
-    disc: Disc,
-    rows: u32,
-    accuracy: Accuracy,
-    work: &mut u64,
-    stop: &AtomicBool,
-) -> Option<Law> {
-    follow(model, course(disc, rows), accuracy, work, stop)
+/// Computes the exact law of a disc on a tissue with these cuts, of 21 rows as [`exact`] does, with at most `most_work` springs times
+/// iterations. `None` if they do not suffice, or if another thread sets `stop`. Unwinds with a refusal if there is no memory.
+pub fn exact_within(model: &Model, cuts: &Cuts, disc: Disc, most_work: u64, stop: &AtomicBool) -> Option<Law> {
+    follow(model, cuts, course(disc, ROWS), Accuracy::EXACT, &mut { most_work }, stop)
 }
 
 /// Computes the law of a course of depths, and subtracts its work from `work`.
 pub(super) fn follow(
     model: &Model,
+    cuts: &Cuts,
     course: Course,
     accuracy: Accuracy,
     work: &mut u64,
     stop: &AtomicBool,
 ) -> Option<Law> {
-    let mut press = Press::within(model, course, accuracy, *work)?;
+    let mut press = Press::within(model, cuts, course, accuracy, *work)?;
     let mut deepened = Deepened::Further;
     while deepened == Deepened::Further {
         deepened = press.deepen(model, stop);
@@ -140,18 +131,19 @@ mod tests {
     fn a_law_that_would_take_too_long_or_that_nobody_waits_for_is_none() {
         let model = Model::paper(&["sheet.points=[9, 9]"]);
         let radius_m = 2.0 * model.shape().edge_m();
+        let whole = Cuts::default();
         let (go_on, stop) = (AtomicBool::new(false), AtomicBool::new(true));
         let (exact, disc) = (exact(&model, radius_m), Disc::in_middle(&model, radius_m));
         assert!(!exact.is_coarse && exact.rows.len() == 21);
-        assert_eq!(exact_within(&model, disc, u64::MAX, &go_on).as_ref(), Some(&exact));
-        assert!(exact_within(&model, disc, u64::MAX, &stop).is_none());
+        assert_eq!(exact_within(&model, &whole, disc, u64::MAX, &go_on).as_ref(), Some(&exact));
+        assert!(exact_within(&model, &whole, disc, u64::MAX, &stop).is_none());
         // Too little for certain, and too little as it turns out.
-        assert!(exact_within(&model, disc, 1000, &go_on).is_none());
-        assert!(Computation::new(&model, disc, 1000).is_none());
-        assert!(Computation::new(&model, disc, 100_000).is_some());
-        assert!(exact_within(&model, disc, 100_000, &go_on).is_none());
+        assert!(exact_within(&model, &whole, disc, 1000, &go_on).is_none());
+        assert!(Computation::new(&model, &whole, disc, 1000).is_none());
+        assert!(Computation::new(&model, &whole, disc, 100_000).is_some());
+        assert!(exact_within(&model, &whole, disc, 100_000, &go_on).is_none());
         // Depth by depth it has the same bits, and once stopped it stays given up.
-        let mut computation = Computation::new(&model, disc, u64::MAX).unwrap();
+        let mut computation = Computation::new(&model, &whole, disc, u64::MAX).unwrap();
         for depth in 1.. {
             match computation.advance(&model, &go_on) {
                 LawProgress::UnderWay(further) => computation = further,
@@ -163,7 +155,7 @@ mod tests {
             }
         }
         let LawProgress::UnderWay(computation) =
-            Computation::new(&model, disc, u64::MAX).unwrap().advance(&model, &go_on)
+            Computation::new(&model, &whole, disc, u64::MAX).unwrap().advance(&model, &go_on)
         else {
             panic!("one depth is not all");
         };

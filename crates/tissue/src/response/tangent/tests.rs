@@ -1,6 +1,8 @@
 //! Tests that compare linearised springs with the springs themselves, and with closed forms.
 #![allow(clippy::unwrap_used)]
 
+mod cuts;
+
 use std::sync::Arc;
 
 use glam::DVec2;
@@ -24,7 +26,7 @@ fn patch<'m>(model: &'m Model, radius: f64, displacement_m: impl Fn([usize; 2]) 
     let footprint = Footprint::new(model, radius * sheet.spacing_m, centre_m.extend(0.0));
     let window = Window::Grid { origin: [0, 0], size: model.points };
     let displacement_m = (0..model.len()).map(|index| displacement_m(model.point_of(index))).collect();
-    LinearPatch::new(model, &footprint, window, displacement_m)
+    LinearPatch::new(model, &Cuts::default(), &footprint, window, displacement_m)
 }
 
 /// Values between −1 and 1 that are different for each point and component.
@@ -159,7 +161,7 @@ fn after_a_press_every_point_is_in_balance() {
     let model = model(&["sheet.points=[9, 9]", "anchor_springs.stiffness_n_per_m=0.5", "sheet.fixed=edges"]);
     let mut patch = patch(&model, 1.0, |_| DVec3::ZERO);
     let depth_m = 1.5 * model.scene.sheet().unwrap().spacing_m;
-    let force_n = patch.press(depth_m);
+    let force_n = patch.press(Some(-depth_m));
     let place_m: f64 = patch.weights.iter().zip(&patch.displacement_m).map(|(weight, u)| weight * u.z).sum();
     assert!((place_m + depth_m).abs() < 1e-6 * depth_m, "{place_m}");
     let forces = forces_n(&model, &patch.displacement_m);
@@ -256,7 +258,7 @@ fn the_points_of_a_window_that_move_are_those_whose_springs_end_in_it() {
         let footprint = Footprint::new(&model, 1.5 * spacing_m, (DVec2::from(centre) * spacing_m).extend(0.0));
         let window = Window::around(&model, &footprint);
         let points: Vec<[usize; 2]> = window.points(&model).map(|index| model.point_of(index)).collect();
-        let free = window.free(&model);
+        let free = window.free(&model, None);
         assert!(free.len() == points.len() && free.iter().any(|free| !free), "{centre:?}: all of the sheet");
         for ([i, j], free) in points.iter().zip(&free) {
             let around = points.iter().filter(|[k, l]| k.abs_diff(*i) <= 1 && l.abs_diff(*j) <= 1).count();

@@ -6,6 +6,7 @@ use glam::DVec3;
 use std::sync::Arc;
 
 use super::*;
+use crate::body::severed::Cuts;
 use crate::body::window::{Window, half_window_m};
 use crate::limits::Limits;
 use crate::response::tangent::LinearPatch;
@@ -109,7 +110,8 @@ fn a_tissue_some_of_whose_points_have_no_anchor_sleeps_wakes_and_tells_its_reach
     let footprint = Footprint::new(&model, 0.005, top_m);
     let window = Window::around(&model, &footprint);
     assert_eq!(window.len(), model.len());
-    let tangent = LinearPatch::new(&model, &footprint, window, vec![DVec3::ZERO; model.len()]).tangent();
+    let tangent =
+        LinearPatch::new(&model, &Cuts::default(), &footprint, window, vec![DVec3::ZERO; model.len()]).tangent();
     assert!(tangent.stiffness_n_per_m.is_finite() && tangent.stiffness_n_per_m.determinant() > 0.0, "{tangent:?}");
     // It sleeps until something acts on it.
     let extent = model.shape().extent();
