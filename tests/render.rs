@@ -218,6 +218,32 @@ fn a_wound_is_open_between_two_lips_and_nothing_else_changes() {
 }
 
 #[test]
+fn what_a_tip_burns_is_dark_and_nothing_else_is() {
+    let folder = tempfile::tempdir().unwrap();
+    // Burnt for two thirds of the time in which it burns through, and left alone.
+    let script = folder.path().join("burn.toml");
+    let text = "duration_s = 1.0\nsample_every_s = 0.1\n[[tool]]\ntip = { radius_m = 0.006, grasps = true, burn_s = 0.3 }\n\
+                poses = [{ at_s = 0.0, place_m = [0.0375, 0.0375, 0.0] }]\nuntil_s = 0.2\n";
+    std::fs::write(&script, text).unwrap();
+    let view = ["--camera", "0,90", "--size", "200x150", "--set", "appearance.texture_size=64"];
+    // As a net the surface is pale, and stays paler.
+    for (more, tenths) in [(&[][..], 7), (&["--wireframe"], 9)] {
+        let of = |at_s: &str| {
+            let arguments = [&["render", "liver", script.to_str().unwrap(), "--at-s", at_s], &view[..], more].concat();
+            decoded(&made("a.png", &arguments))
+        };
+        let [whole, burnt] = ["0", "1"].map(of);
+        let light = |image: &Image, x: usize, y: usize| pixel(image, x, y).into_iter().map(u32::from).sum::<u32>();
+        let darker = |x: usize, y: usize| 10 * light(&burnt, x, y) < tenths * light(&whole, x, y);
+        let dark: Vec<[usize; 2]> =
+            (0..150).flat_map(|y| (0..200).map(move |x| [x, y])).filter(|[x, y]| darker(*x, *y)).collect();
+        // A disc of some 12 of 75 mm.
+        assert!((100..1000).contains(&dark.len()), "{more:?}: {}", dark.len());
+        assert!(dark.iter().all(|[x, y]| x.abs_diff(96) < 25 && y.abs_diff(66) < 25), "{more:?}: {dark:?}");
+    }
+}
+
+#[test]
 fn a_dent_shows_where_the_force_is() {
     let view = ["--camera", "0,90", "--size", "96x72", "--set", "appearance.texture_size=64"];
     let of = |more: &[&str]| decoded(&made("a.png", &[&["render", "paper", "vertical-60"], &view[..], more].concat()));

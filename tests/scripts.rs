@@ -522,6 +522,11 @@ fn a_burn_is_part_of_a_snapshot_and_of_a_continued_session() {
         assert_eq!(again.tissue().cuts().is_empty(), step < 248, "after step {step}");
     }
     assert_eq!(again.tissue().state_hash(), simulation.session.tissue().state_hash());
+    let burnt = [&again, &simulation.session].map(|session| {
+        session.tissue().burns().points(&model).map(|burnt| (burnt.point, burnt.burn)).collect::<Vec<_>>()
+    });
+    assert!(burnt[0] == burnt[1] && burnt[0].iter().all(|(_, burn)| *burn == 1.0), "{burnt:?}");
+    assert_eq!(again.save().to_bytes(), simulation.session.save().to_bytes());
 }
 
 #[test]

@@ -12,6 +12,7 @@
 ("DrainNodeRequest", |bytes| <DrainNodeRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("FinishExerciseRequest", |bytes| <FinishExerciseRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("FreeToolRequest", |bytes| <FreeToolRequest as ::prost::Message>::decode(bytes).is_ok()),
+("GetBurnsRequest", |bytes| <GetBurnsRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetJournalRequest", |bytes| <GetJournalRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetMeshRequest", |bytes| <GetMeshRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetScriptRequest", |bytes| <GetScriptRequest as ::prost::Message>::decode(bytes).is_ok()),

@@ -8133,6 +8133,73 @@ impl ::prost::Name for CutTriangles {
     }
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetBurnsRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// The refinement of the frames that show it.
+    #[prost(uint32, tag = "2")]
+    pub refinement: u32,
+    /// The version that the client knows: then only what has changed since, if that tells all. 0: everything.
+    #[prost(uint32, tag = "3")]
+    pub since_version: u32,
+}
+impl ::prost::Name for GetBurnsRequest {
+    const NAME: &'static str = "GetBurnsRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GetBurnsRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GetBurnsRequest".into()
+    }
+}
+/// A part of what tips have burnt. The lists of all parts, concatenated, are the whole.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetBurnsResponse {
+    /// The version of what is burnt, which frames have: it grows with each step in which the burn of a point reaches another multiple of
+    /// 1/255, and if the server undoes a burn.
+    #[prost(uint32, tag = "1")]
+    pub version: u32,
+    /// Whether the list follows what the client has of `since_version`; otherwise the vertices that it does not name are not burnt.
+    #[prost(bool, tag = "2")]
+    pub continues: bool,
+    #[prost(message, repeated, tag = "3")]
+    pub burns: ::prost::alloc::vec::Vec<VertexBurn>,
+    /// Whether this is the last part.
+    #[prost(bool, tag = "4")]
+    pub last: bool,
+}
+impl ::prost::Name for GetBurnsResponse {
+    const NAME: &'static str = "GetBurnsResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.GetBurnsResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.GetBurnsResponse".into()
+    }
+}
+/// How burnt a vertex of the surface is.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct VertexBurn {
+    /// Its index in a frame.
+    #[prost(uint32, tag = "1")]
+    pub vertex: u32,
+    /// Time of contact divided by that in which it burns through (Tip.burn_s), 0 to 1; between points interpolated.
+    #[prost(float, tag = "2")]
+    pub burn: f32,
+}
+impl ::prost::Name for VertexBurn {
+    const NAME: &'static str = "VertexBurn";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.VertexBurn".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.VertexBurn".into()
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetTextureRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
@@ -8260,6 +8327,9 @@ pub struct WatchFramesResponse {
     /// The version of what joins the points (GetTopology); 0 if nothing was severed.
     #[prost(uint32, tag = "17")]
     pub topology_version: u32,
+    /// The version of what is burnt (GetBurns); 0 if nothing is.
+    #[prost(uint32, tag = "18")]
+    pub burn_version: u32,
 }
 impl ::prost::Name for WatchFramesResponse {
     const NAME: &'static str = "WatchFramesResponse";
@@ -8517,6 +8587,31 @@ pub mod view_service_client {
                 .insert(GrpcMethod::new("palpate.v1.ViewService", "GetWound"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// Returns what tips have burnt of the surface that frames show, in parts.
+        pub async fn get_burns(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetBurnsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::GetBurnsResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ViewService/GetBurns",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ViewService", "GetBurns"));
+            self.inner.server_streaming(req, path, codec).await
+        }
         /// Returns the image of the tissue's surface, in parts.
         pub async fn get_texture(
             &mut self,
@@ -8645,6 +8740,17 @@ pub mod view_service_server {
             &self,
             request: tonic::Request<super::GetWoundRequest>,
         ) -> std::result::Result<tonic::Response<Self::GetWoundStream>, tonic::Status>;
+        /// Server streaming response type for the GetBurns method.
+        type GetBurnsStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::GetBurnsResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns what tips have burnt of the surface that frames show, in parts.
+        async fn get_burns(
+            &self,
+            request: tonic::Request<super::GetBurnsRequest>,
+        ) -> std::result::Result<tonic::Response<Self::GetBurnsStream>, tonic::Status>;
         /// Server streaming response type for the GetTexture method.
         type GetTextureStream: tonic::codegen::tokio_stream::Stream<
                 Item = std::result::Result<super::GetTextureResponse, tonic::Status>,
@@ -8879,6 +8985,52 @@ pub mod view_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetWoundSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ViewService/GetBurns" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetBurnsSvc<T: ViewService>(pub Arc<T>);
+                    impl<
+                        T: ViewService,
+                    > tonic::server::ServerStreamingService<super::GetBurnsRequest>
+                    for GetBurnsSvc<T> {
+                        type Response = super::GetBurnsResponse;
+                        type ResponseStream = T::GetBurnsStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetBurnsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ViewService>::get_burns(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetBurnsSvc(inner);
                         let codec = crate::codec::BoundedCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

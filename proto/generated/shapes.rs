@@ -1134,6 +1134,21 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 0) },
 ] },
+Shape { name: "palpate.v1.GetBurnsRequest", bytes: size_of::<crate::pb::GetBurnsRequest>(), decode: |bytes| <crate::pb::GetBurnsRequest as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Text },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 3, is_list: false, kind: FieldKind::Number(4, 0) },
+] },
+Shape { name: "palpate.v1.GetBurnsResponse", bytes: size_of::<crate::pb::GetBurnsResponse>(), decode: |bytes| <crate::pb::GetBurnsResponse as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(180) },
+Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
+] },
+Shape { name: "palpate.v1.VertexBurn", bytes: size_of::<crate::pb::VertexBurn>(), decode: |bytes| <crate::pb::VertexBurn as Message>::decode(bytes).is_ok(), fields: &[
+Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
+] },
 Shape { name: "palpate.v1.GetTextureRequest", bytes: size_of::<crate::pb::GetTextureRequest>(), decode: |bytes| <crate::pb::GetTextureRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
@@ -1167,9 +1182,10 @@ Field { number: 11, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 12, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 13, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 14, is_list: false, kind: FieldKind::Number(8, 8) },
-Field { number: 15, is_list: true, kind: FieldKind::Message(182) },
+Field { number: 15, is_list: true, kind: FieldKind::Message(185) },
 Field { number: 16, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 17, is_list: false, kind: FieldKind::Number(4, 0) },
+Field { number: 18, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.v1.Patch", bytes: size_of::<crate::pb::Patch>(), decode: |bytes| <crate::pb::Patch as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1187,7 +1203,7 @@ Shape { name: "palpate.v1.AcknowledgeFramesResponse", bytes: size_of::<crate::pb
 Shape { name: "palpate.v1.ListNodesRequest", bytes: size_of::<crate::pb::ListNodesRequest>(), decode: |bytes| <crate::pb::ListNodesRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListNodesResponse", bytes: size_of::<crate::pb::ListNodesResponse>(), decode: |bytes| <crate::pb::ListNodesResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(187) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(190) },
 ] },
 Shape { name: "palpate.v1.Node", bytes: size_of::<crate::pb::Node>(), decode: |bytes| <crate::pb::Node as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1202,7 +1218,7 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(1, 0) },
 Shape { name: "palpate.v1.ListFleetSessionsRequest", bytes: size_of::<crate::pb::ListFleetSessionsRequest>(), decode: |bytes| <crate::pb::ListFleetSessionsRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListFleetSessionsResponse", bytes: size_of::<crate::pb::ListFleetSessionsResponse>(), decode: |bytes| <crate::pb::ListFleetSessionsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(190) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(193) },
 ] },
 Shape { name: "palpate.v1.FleetSession", bytes: size_of::<crate::pb::FleetSession>(), decode: |bytes| <crate::pb::FleetSession as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1229,7 +1245,7 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(4, 0) },
 Shape { name: "palpate.v1.ListCallersRequest", bytes: size_of::<crate::pb::ListCallersRequest>(), decode: |bytes| <crate::pb::ListCallersRequest as Message>::decode(bytes).is_ok(), fields: &[
 ] },
 Shape { name: "palpate.v1.ListCallersResponse", bytes: size_of::<crate::pb::ListCallersResponse>(), decode: |bytes| <crate::pb::ListCallersResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(197) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(200) },
 ] },
 Shape { name: "palpate.v1.CallerUse", bytes: size_of::<crate::pb::CallerUse>(), decode: |bytes| <crate::pb::CallerUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1243,7 +1259,7 @@ Shape { name: "palpate.v1.ListStreamsRequest", bytes: size_of::<crate::pb::ListS
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.ListStreamsResponse", bytes: size_of::<crate::pb::ListStreamsResponse>(), decode: |bytes| <crate::pb::ListStreamsResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(200) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(203) },
 ] },
 Shape { name: "palpate.v1.StreamUse", bytes: size_of::<crate::pb::StreamUse>(), decode: |bytes| <crate::pb::StreamUse as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
@@ -1288,15 +1304,15 @@ Shape { name: "palpate.v1.CreateHereResponse", bytes: size_of::<crate::pb::Creat
 Field { number: 1, is_list: false, kind: FieldKind::Message(119) },
 ] },
 Shape { name: "palpate.v1.MirrorRequest", bytes: size_of::<crate::pb::MirrorRequest>(), decode: |bytes| <crate::pb::MirrorRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(212) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(213) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(215) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(215) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(216) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(218) },
 ] },
 Shape { name: "palpate.v1.MirrorOpen", bytes: size_of::<crate::pb::MirrorOpen>(), decode: |bytes| <crate::pb::MirrorOpen as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorParts", bytes: size_of::<crate::pb::MirrorParts>(), decode: |bytes| <crate::pb::MirrorParts as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(214) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(217) },
 ] },
 Shape { name: "palpate.v1.MirrorPart", bytes: size_of::<crate::pb::MirrorPart>(), decode: |bytes| <crate::pb::MirrorPart as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1308,7 +1324,7 @@ Shape { name: "palpate.v1.MirrorEnd", bytes: size_of::<crate::pb::MirrorEnd>(), 
 Field { number: 1, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.MirrorResponse", bytes: size_of::<crate::pb::MirrorResponse>(), decode: |bytes| <crate::pb::MirrorResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(217) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(220) },
 ] },
 Shape { name: "palpate.v1.Mirrored", bytes: size_of::<crate::pb::Mirrored>(), decode: |bytes| <crate::pb::Mirrored as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1317,13 +1333,13 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.v1.TakeSessionRequest", bytes: size_of::<crate::pb::TakeSessionRequest>(), decode: |bytes| <crate::pb::TakeSessionRequest as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
-Field { number: 2, is_list: false, kind: FieldKind::Message(219) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(222) },
 Field { number: 3, is_list: false, kind: FieldKind::Text },
 ] },
 Shape { name: "palpate.v1.TakeOver", bytes: size_of::<crate::pb::TakeOver>(), decode: |bytes| <crate::pb::TakeOver as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(221) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(220) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(224) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(223) },
 ] },
 Shape { name: "palpate.v1.KnownLaw", bytes: size_of::<crate::pb::KnownLaw>(), decode: |bytes| <crate::pb::KnownLaw as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1344,19 +1360,19 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(224) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(227) },
 ] },
 Shape { name: "palpate.journal.v1.Input", bytes: size_of::<crate::journal::Input>(), decode: |bytes| <crate::journal::Input as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(225) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(234) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(235) },
-Field { number: 5, is_list: false, kind: FieldKind::Message(236) },
-Field { number: 6, is_list: false, kind: FieldKind::Message(237) },
-Field { number: 7, is_list: false, kind: FieldKind::Message(238) },
-Field { number: 8, is_list: false, kind: FieldKind::Message(239) },
-Field { number: 9, is_list: false, kind: FieldKind::Message(241) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(240) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(228) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(237) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(238) },
+Field { number: 5, is_list: false, kind: FieldKind::Message(239) },
+Field { number: 6, is_list: false, kind: FieldKind::Message(240) },
+Field { number: 7, is_list: false, kind: FieldKind::Message(241) },
+Field { number: 8, is_list: false, kind: FieldKind::Message(242) },
+Field { number: 9, is_list: false, kind: FieldKind::Message(244) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(243) },
 ] },
 Shape { name: "palpate.journal.v1.Command", bytes: size_of::<crate::journal::Command>(), decode: |bytes| <crate::journal::Command as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
@@ -1368,12 +1384,12 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 10, is_list: false, kind: FieldKind::Message(229) },
-Field { number: 11, is_list: false, kind: FieldKind::Message(230) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(231) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(233) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(227) },
-Field { number: 15, is_list: false, kind: FieldKind::Message(226) },
+Field { number: 10, is_list: false, kind: FieldKind::Message(232) },
+Field { number: 11, is_list: false, kind: FieldKind::Message(233) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(234) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(236) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(230) },
+Field { number: 15, is_list: false, kind: FieldKind::Message(229) },
 ] },
 Shape { name: "palpate.journal.v1.Mark", bytes: size_of::<crate::journal::Mark>(), decode: |bytes| <crate::journal::Mark as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
@@ -1381,7 +1397,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.journal.v1.Tie", bytes: size_of::<crate::journal::Tie>(), decode: |bytes| <crate::journal::Tie as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(228) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(231) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1404,7 +1420,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
 Shape { name: "palpate.journal.v1.Pose", bytes: size_of::<crate::journal::Pose>(), decode: |bytes| <crate::journal::Pose as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Message(0) },
 Field { number: 2, is_list: false, kind: FieldKind::Message(0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(232) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(235) },
 ] },
 Shape { name: "palpate.journal.v1.Tip", bytes: size_of::<crate::journal::Tip>(), decode: |bytes| <crate::journal::Tip as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1451,12 +1467,12 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
 ] },
 Shape { name: "palpate.journal.v1.ExerciseResult", bytes: size_of::<crate::journal::ExerciseResult>(), decode: |bytes| <crate::journal::ExerciseResult as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(245) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(248) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(242) },
-Field { number: 6, is_list: true, kind: FieldKind::Message(243) },
-Field { number: 7, is_list: true, kind: FieldKind::Message(244) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(245) },
+Field { number: 6, is_list: true, kind: FieldKind::Message(246) },
+Field { number: 7, is_list: true, kind: FieldKind::Message(247) },
 ] },
 Shape { name: "palpate.journal.v1.EarnedCriterion", bytes: size_of::<crate::journal::EarnedCriterion>(), decode: |bytes| <crate::journal::EarnedCriterion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },
@@ -1465,12 +1481,12 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 8) },
 Shape { name: "palpate.journal.v1.GivenAnswer", bytes: size_of::<crate::journal::GivenAnswer>(), decode: |bytes| <crate::journal::GivenAnswer as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(226) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(229) },
 ] },
 Shape { name: "palpate.journal.v1.PhaseResult", bytes: size_of::<crate::journal::PhaseResult>(), decode: |bytes| <crate::journal::PhaseResult as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(245) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(248) },
 ] },
 Shape { name: "palpate.journal.v1.Figure", bytes: size_of::<crate::journal::Figure>(), decode: |bytes| <crate::journal::Figure as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1486,23 +1502,23 @@ Shape { name: "palpate.journal.v1.Snapshot", bytes: size_of::<crate::journal::Sn
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(234) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(237) },
 Field { number: 5, is_list: false, kind: FieldKind::Text },
 Field { number: 6, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 7, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 Shape { name: "palpate.journal.v1.Felt", bytes: size_of::<crate::journal::Felt>(), decode: |bytes| <crate::journal::Felt as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(249) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(252) },
 ] },
 Shape { name: "palpate.journal.v1.Moment", bytes: size_of::<crate::journal::Moment>(), decode: |bytes| <crate::journal::Moment as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(250) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(253) },
 ] },
 Shape { name: "palpate.journal.v1.FeltTool", bytes: size_of::<crate::journal::FeltTool>(), decode: |bytes| <crate::journal::FeltTool as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(251) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(251) },
-Field { number: 4, is_list: false, kind: FieldKind::Message(251) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(254) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(254) },
+Field { number: 4, is_list: false, kind: FieldKind::Message(254) },
 ] },
 Shape { name: "palpate.journal.v1.Vector", bytes: size_of::<crate::journal::Vector>(), decode: |bytes| <crate::journal::Vector as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 4) },
@@ -1510,7 +1526,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(4, 4) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(4, 4) },
 ] },
 Shape { name: "palpate.journal.v1.Waiting", bytes: size_of::<crate::journal::Waiting>(), decode: |bytes| <crate::journal::Waiting as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(224) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(227) },
 ] },
 Shape { name: "palpate.journal.v1.Signature", bytes: size_of::<crate::journal::Signature>(), decode: |bytes| <crate::journal::Signature as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1532,11 +1548,11 @@ Field { number: 8, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 9, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 11, is_list: false, kind: FieldKind::Message(90) },
-Field { number: 12, is_list: false, kind: FieldKind::Message(257) },
-Field { number: 13, is_list: false, kind: FieldKind::Message(260) },
-Field { number: 14, is_list: false, kind: FieldKind::Message(234) },
+Field { number: 12, is_list: false, kind: FieldKind::Message(260) },
+Field { number: 13, is_list: false, kind: FieldKind::Message(263) },
+Field { number: 14, is_list: false, kind: FieldKind::Message(237) },
 Field { number: 15, is_list: false, kind: FieldKind::Number(8, 0) },
-Field { number: 16, is_list: false, kind: FieldKind::Message(256) },
+Field { number: 16, is_list: false, kind: FieldKind::Message(259) },
 ] },
 Shape { name: "palpate.journal.v1.RecordedExercise", bytes: size_of::<crate::journal::RecordedExercise>(), decode: |bytes| <crate::journal::RecordedExercise as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1548,8 +1564,8 @@ Shape { name: "palpate.journal.v1.TriangleMesh", bytes: size_of::<crate::journal
 Field { number: 1, is_list: true, kind: FieldKind::Number(8, 8) },
 Field { number: 2, is_list: true, kind: FieldKind::Number(4, 0) },
 Field { number: 3, is_list: true, kind: FieldKind::Number(4, 4) },
-Field { number: 4, is_list: true, kind: FieldKind::Message(259) },
-Field { number: 5, is_list: true, kind: FieldKind::Message(258) },
+Field { number: 4, is_list: true, kind: FieldKind::Message(262) },
+Field { number: 5, is_list: true, kind: FieldKind::Message(261) },
 ] },
 Shape { name: "palpate.journal.v1.VolumeRegion", bytes: size_of::<crate::journal::VolumeRegion>(), decode: |bytes| <crate::journal::VolumeRegion as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Text },
@@ -1595,7 +1611,7 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 #[cfg(feature = "etcd")]
 Shape { name: "mvccpb.Event", bytes: size_of::<crate::etcd::mvccpb::Event>(), decode: |bytes| <crate::etcd::mvccpb::Event as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(4, 0) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(263) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(266) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseHeader", bytes: size_of::<crate::etcd::etcdserverpb::ResponseHeader>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseHeader as Message>::decode(bytes).is_ok(), fields: &[
@@ -1611,8 +1627,8 @@ Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::RangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::RangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(263) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(266) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 ] },
 #[cfg(feature = "etcd")]
@@ -1623,7 +1639,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.PutResponse", bytes: size_of::<crate::etcd::etcdserverpb::PutResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::PutResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeRequest", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1632,20 +1648,20 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.DeleteRangeResponse", bytes: size_of::<crate::etcd::etcdserverpb::DeleteRangeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::DeleteRangeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.RequestOp", bytes: size_of::<crate::etcd::etcdserverpb::RequestOp>(), decode: |bytes| <crate::etcd::etcdserverpb::RequestOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(266) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(268) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(270) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(269) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(271) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(273) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.ResponseOp", bytes: size_of::<crate::etcd::etcdserverpb::ResponseOp>(), decode: |bytes| <crate::etcd::etcdserverpb::ResponseOp as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(267) },
-Field { number: 2, is_list: false, kind: FieldKind::Message(269) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(271) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(270) },
+Field { number: 2, is_list: false, kind: FieldKind::Message(272) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(274) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.Compare", bytes: size_of::<crate::etcd::etcdserverpb::Compare>(), decode: |bytes| <crate::etcd::etcdserverpb::Compare as Message>::decode(bytes).is_ok(), fields: &[
@@ -1657,20 +1673,20 @@ Field { number: 6, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnRequest", bytes: size_of::<crate::etcd::etcdserverpb::TxnRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: true, kind: FieldKind::Message(274) },
-Field { number: 2, is_list: true, kind: FieldKind::Message(272) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(272) },
+Field { number: 1, is_list: true, kind: FieldKind::Message(277) },
+Field { number: 2, is_list: true, kind: FieldKind::Message(275) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(275) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.TxnResponse", bytes: size_of::<crate::etcd::etcdserverpb::TxnResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::TxnResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 3, is_list: true, kind: FieldKind::Message(273) },
+Field { number: 3, is_list: true, kind: FieldKind::Message(276) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchRequest as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(278) },
-Field { number: 3, is_list: false, kind: FieldKind::Message(279) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(281) },
+Field { number: 3, is_list: false, kind: FieldKind::Message(282) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchCreateRequest", bytes: size_of::<crate::etcd::etcdserverpb::WatchCreateRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchCreateRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1685,14 +1701,14 @@ Shape { name: "etcdserverpb.WatchProgressRequest", bytes: size_of::<crate::etcd:
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.WatchResponse", bytes: size_of::<crate::etcd::etcdserverpb::WatchResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::WatchResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(1, 0) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 6, is_list: false, kind: FieldKind::Text },
 Field { number: 7, is_list: false, kind: FieldKind::Number(1, 0) },
-Field { number: 11, is_list: true, kind: FieldKind::Message(264) },
+Field { number: 11, is_list: true, kind: FieldKind::Message(267) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1701,7 +1717,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseGrantResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseGrantResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseGrantResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1711,7 +1727,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseRevokeResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseRevokeResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseRevokeResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveRequest", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveRequest>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveRequest as Message>::decode(bytes).is_ok(), fields: &[
@@ -1719,7 +1735,7 @@ Field { number: 1, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.LeaseKeepAliveResponse", bytes: size_of::<crate::etcd::etcdserverpb::LeaseKeepAliveResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::LeaseKeepAliveResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 3, is_list: false, kind: FieldKind::Number(8, 0) },
 ] },
@@ -1730,7 +1746,7 @@ Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.AuthenticateResponse", bytes: size_of::<crate::etcd::etcdserverpb::AuthenticateResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::AuthenticateResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 ] },
 #[cfg(feature = "etcd")]
@@ -1738,7 +1754,7 @@ Shape { name: "etcdserverpb.StatusRequest", bytes: size_of::<crate::etcd::etcdse
 ] },
 #[cfg(feature = "etcd")]
 Shape { name: "etcdserverpb.StatusResponse", bytes: size_of::<crate::etcd::etcdserverpb::StatusResponse>(), decode: |bytes| <crate::etcd::etcdserverpb::StatusResponse as Message>::decode(bytes).is_ok(), fields: &[
-Field { number: 1, is_list: false, kind: FieldKind::Message(265) },
+Field { number: 1, is_list: false, kind: FieldKind::Message(268) },
 Field { number: 2, is_list: false, kind: FieldKind::Text },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 0) },
 Field { number: 10, is_list: false, kind: FieldKind::Number(1, 0) },

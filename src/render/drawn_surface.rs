@@ -16,6 +16,8 @@ pub(super) struct Vertex {
     pub(super) facing: DVec3,
     /// Fraction of ambient light that reaches the vertex: less in a dent.
     pub(super) open: f64,
+    /// How burnt it is, 0 to 1.
+    pub(super) burn: f64,
 }
 
 /// The vertices, triangles and lines that are drawn.

@@ -6,12 +6,13 @@ use std::sync::Arc;
 use super::picture::{Arrow, View, picture};
 use palpate_session::Session;
 use palpate_session::simulation::{Simulation, SimulationFailure};
+use palpate_session::surface::burns::vertex_burns;
 use palpate_session::surface::{Skin, Snapshot, Wound};
 use palpate_texture::Image;
-use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::{Burns, Model};
 
 /// A script that is played on a session of its own, step by step and only forwards, to make pictures of it.
 pub struct Film<'a> {
@@ -23,6 +24,7 @@ pub struct Film<'a> {
 /// The tissue at one moment, and the forces that act on it: all that a picture needs besides the model and the view.
 pub struct Still {
     snapshot: Snapshot,
+    burns: Burns,
     shown: Option<Arc<Skin>>,
     arrows: Vec<Arrow>,
 }
@@ -88,7 +90,7 @@ impl Still {
         let snapshot = Snapshot::new(&session.model().scene, session.step_count(), session.time_s(), displacement_m)
             .with_skin(shown)
             .with_cuts(session.tissue().cuts());
-        Still { snapshot, shown: shown.cloned(), arrows }
+        Still { snapshot, burns: session.tissue().burns(), shown: shown.cloned(), arrows }
     }
 
     /// Returns the simulated time, s.
@@ -100,7 +102,8 @@ impl Still {
     pub fn picture(&self, model: &Model, view: &View) -> Image {
         let shown = self.shown.as_deref();
         let wound = Wound::of(model, self.snapshot.cuts(), shown, view.refinement);
-        picture(model.shape(), shown, &self.snapshot, wound.as_ref(), &self.arrows, view)
+        let burns = vertex_burns(model, &self.burns, shown, view.refinement, 0);
+        picture(model.shape(), shown, &self.snapshot, wound.as_ref(), &burns, &self.arrows, view)
     }
 }
 

@@ -5,6 +5,7 @@ use glam::{DVec2, DVec3, Vec3Swizzles};
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use super::drawn_surface::{DrawnSurface, Vertex};
 use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_session::surface::burns::VertexBurn;
 use palpate_session::surface::{Refinement, Skin as Shown, Snapshot, Wound};
 use palpate_texture::Image;
 use palpate_tissue::shape::{PointId, PointName, RestShape};
@@ -95,6 +96,9 @@ const PALE_WOUND: [[u8; 3]; 2] = [[176, 96, 92], [96, 36, 34]];
 /// What the surface within a cut reflects of red, green and blue, beside the surface of the tissue.
 const CUT_FACE: DVec3 = DVec3::new(0.60, 0.34, 0.32);
 
+/// What tissue reflects that turned brown, and that is charred.
+const CHAR: [DVec3; 2] = [DVec3::new(0.16, 0.055, 0.025), DVec3::new(0.012, 0.010, 0.009)];
+
 /// Width of the line along a lip, as a fraction of the picture's width.
 const LIP: f64 = 0.0016;
 
@@ -136,17 +140,18 @@ impl Eye {
 }
 
 /// Draws the tissue of rest shape `shape` in the state of `snapshot`, with `arrows`, as seen by `view`. `shown` is
-/// the surface that frames show of a mesh; `None` for a sheet. `wound` is that of the surface, at the view's refinement. Returns an image of [`View::size`], equal on any
+/// the surface that frames show of a mesh; `None` for a sheet. `wound` and `burns` are those of the surface, at the view's refinement. Returns an image of [`View::size`], equal on any
 /// machine. Parts nearer to the eye than a hundredth of the tissue's longest side are left out.
 pub fn picture(
     shape: &dyn RestShape,
     shown: Option<&Shown>,
     snapshot: &Snapshot,
     wound: Option<&Wound>,
+    burns: &[VertexBurn],
     arrows: &[Arrow],
     view: &View,
 ) -> Image {
-    let surface = DrawnSurface::new(shape, shown, snapshot, wound, view.refinement);
+    let surface = DrawnSurface::new(shape, shown, snapshot, (wound, burns), view.refinement);
     let eye = Eye::new(shape, view);
     let nearest_m = 0.01 * shape.longest_side_m();
     let background = if view.texture.is_some() { [20, 14, 13] } else { [255, 255, 255] };
@@ -160,7 +165,10 @@ pub fn picture(
         canvas.triangle([p, q, r], |shares| match &skin {
             Some(skin) => skin.shade(&between(&vertices, shares)),
             // Pale enough for lines to show, and opaque.
-            None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
+            None => {
+                let Vertex { open, burn, .. } = between(&vertices, shares);
+                DVec3::splat((0.80 + 0.18 * open) * (1.0 - 0.7 * burn))
+            }
         });
     }
     if skin.is_none() {
@@ -234,6 +242,7 @@ fn between(vertices: &[Vertex; 3], shares: [f64; 3]) -> Vertex {
         sum.rest += share * vertex.rest;
         sum.facing += share * vertex.facing;
         sum.open += share * vertex.open;
+        sum.burn += share * vertex.burn;
     }
     sum
 }
@@ -304,7 +313,10 @@ impl<'a> Skin<'a> {
         // Light scatters a little way in tissue and emerges beyond the edge of a shadow.
         let diffuse = ((normal.dot(to_lamp) + 0.18) / 1.18).max(0.0);
         let around = DVec3::new(0.15, 0.10, 0.09) * normal.z.max(0.0);
-        let albedo = self.albedo_at(vertex);
+        // Burnt tissue turns brown, then black, and is dry: it has no film.
+        let [brown, black] = CHAR;
+        let burn = |from: f64, to: f64| ((vertex.burn - from) / (to - from)).clamp(0.0, 1.0);
+        let albedo = self.albedo_at(vertex).lerp(brown.lerp(black, burn(0.4, 1.0)), burn(0.0, 0.6));
         let mut colour = albedo * vertex.open * (around + DVec3::splat(2.3 * light * diffuse * diffuse));
         // The film of liquid: a broad sheen and a sharp glint, stronger at grazing angles (Schlick's approximation).
         let half = normal.dot((to_lamp + to_eye).normalize_or_zero()).max(0.0);
@@ -312,7 +324,7 @@ impl<'a> Skin<'a> {
         let mirrored = 0.25 + 0.75 * graze.powi(5);
         let power = |squarings: u32| (0..squarings).fold(half, |x, _| x * x);
         let film = 0.14 * power(4) + 1.1 * power(8);
-        colour += DVec3::new(1.0, 0.97, 0.94) * (light * mirrored * film);
+        colour += DVec3::new(1.0, 0.97, 0.94) * (light * mirrored * film * (1.0 - burn(0.0, 0.5)));
         colour
     }
 }

@@ -4,6 +4,7 @@ use glam::{DVec2, DVec3};
 
 use super::drawn_surface::{DrawnSurface, DrawnWound, Vertex};
 use super::wound::{open_wound, show_cut_surface};
+use palpate_session::surface::burns::VertexBurn;
 use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, Wound, encode};
 use palpate_tissue::shape::RestShape;
 
@@ -11,17 +12,17 @@ use palpate_tissue::shape::RestShape;
 const SEAM: f64 = 6.0;
 
 impl DrawnSurface {
-    /// Computes the surface from the frame that a viewer would get of `snapshot`, and opens its wound.
+    /// Computes the surface from the frame that a viewer would get of `snapshot`, as burnt as `burns` tell, and opens its wound.
     pub(super) fn new(
         shape: &dyn RestShape,
         skin: Option<&Skin>,
         snapshot: &Snapshot,
-        wound: Option<&Wound>,
+        of_surface: (Option<&Wound>, &[VertexBurn]),
         refinement: Refinement,
     ) -> Self {
         match skin {
-            None => Self::of_grid(shape, snapshot, wound, refinement),
-            Some(skin) => Self::of_skin(shape, skin, snapshot, wound, refinement),
+            None => Self::of_grid(shape, snapshot, of_surface, refinement),
+            Some(skin) => Self::of_skin(shape, skin, snapshot, of_surface, refinement),
         }
     }
 
@@ -29,7 +30,7 @@ impl DrawnSurface {
         shape: &dyn RestShape,
         skin: &Skin,
         snapshot: &Snapshot,
-        wound: Option<&Wound>,
+        (wound, burns): (Option<&Wound>, &[VertexBurn]),
         refinement: Refinement,
     ) -> Self {
         let moved_m = displacements(snapshot, skin.with_cut_surface(refinement));
@@ -56,6 +57,7 @@ impl DrawnSurface {
                 rest: (rest_m[place] - least_m) / longest_m,
                 facing: if uv.is_some() { DVec3::ZERO } else { at_rest[place].abs() },
                 open: 1.0,
+                burn: burn_of(burns, place),
             }
         };
         let mut lines: Vec<[usize; 2]> = triangles
@@ -110,7 +112,12 @@ impl DrawnSurface {
         }
     }
 
-    fn of_grid(shape: &dyn RestShape, snapshot: &Snapshot, wound: Option<&Wound>, refinement: Refinement) -> Self {
+    fn of_grid(
+        shape: &dyn RestShape,
+        snapshot: &Snapshot,
+        (wound, burns): (Option<&Wound>, &[VertexBurn]),
+        refinement: Refinement,
+    ) -> Self {
         let points = refinement.coarsest();
         // Normals are interpolated between the points, so that shading is smooth: a bilinear patch has creases of its
         // own.
@@ -126,7 +133,8 @@ impl DrawnSurface {
                 let [a, b] = [index / count[1], index % count[1]];
                 let normal = bilinear(grid, &normals, [a, b], part).try_normalize().unwrap_or(DVec3::Z);
                 let share = refinement.texture_at(index);
-                Vertex { at_m, normal, share, open: bilinear(grid, &open, [a, b], part).x, ..Vertex::default() }
+                let (open, burn) = (bilinear(grid, &open, [a, b], part).x, burn_of(burns, index));
+                Vertex { at_m, normal, share, open, burn, ..Vertex::default() }
             })
             .collect();
         let halves = |[a, b, c, d, e, f]: [usize; 6]| [[a, b, c], [d, e, f]];
@@ -147,6 +155,11 @@ impl DrawnSurface {
         }
         surface
     }
+}
+
+/// Returns how burnt a vertex is; `burns` are by ascending vertex.
+fn burn_of(burns: &[VertexBurn], vertex: usize) -> f64 {
+    burns.binary_search_by_key(&vertex, |of| of.vertex as usize).map_or(0.0, |at| f64::from(burns[at].burn))
 }
 
 /// Returns the positions of the vertices, m, from the data that a viewer gets.

@@ -64,6 +64,7 @@ pub(super) fn show_cut_surface(
             rest: share(rest_m),
             facing: facing.abs(),
             open: 1.0,
+            burn: 0.0,
         })
     });
     surface.wound.cut_surface = drawn.collect();
@@ -74,14 +75,15 @@ pub(super) fn show_cut_surface(
 fn lip_vertex(lip: &LipVertex, vertices: &[Vertex], rest_m: impl Fn(usize) -> DVec3) -> Vertex {
     let corners = [lip.host, lip.others[0], lip.others[1]].map(|vertex| vertex as usize);
     let host = vertices[corners[0]];
-    let mut vertex = Vertex { share: Default::default(), rest: DVec3::ZERO, facing: DVec3::ZERO, ..host };
+    let mut vertex = Vertex { share: Default::default(), rest: DVec3::ZERO, facing: DVec3::ZERO, burn: 0.0, ..host };
     vertex.at_m -= rest_m(corners[0]);
     for (corner, share) in corners.into_iter().zip(lip.shares()) {
-        let Vertex { share: texture, rest, facing, .. } = vertices[corner];
+        let Vertex { share: texture, rest, facing, burn, .. } = vertices[corner];
         vertex.at_m += share * rest_m(corner);
         vertex.share += share * texture;
         vertex.rest += share * rest;
         vertex.facing += share * facing;
+        vertex.burn += share * burn;
     }
     vertex
 }

@@ -12,7 +12,7 @@ const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
 
 /// Returns the messages of a frame for the viewer `viewer_id`, in the order of the frame's patches; only the last one
 /// has `last` set. Each has patches of at most 64 KiB together, or a single larger one. `skipped` is the number of
-/// frames before this one that the viewer did not get. A frame without patches tells of a new topology alone.
+/// frames before this one that the viewer did not get. A frame without patches tells of a new topology, or of burns, alone.
 pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::WatchFramesResponse> {
     let frame = &delivery.frame;
     let [vertices_x, vertices_y] = frame.refinement.vertices();
@@ -35,6 +35,7 @@ pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec
         patches: Vec::new(),
         last: false,
         topology_version: frame.topology_version,
+        burn_version: frame.burn_version,
     };
     let mut messages: Vec<pb::WatchFramesResponse> = Vec::new();
     let mut room = 0;

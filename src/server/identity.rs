@@ -125,6 +125,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.SessionService/UploadJournal", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/UploadMesh", Access::Role(Role::Create)),
     ("/palpate.v1.ViewService/AcknowledgeFrames", Access::Role(Role::Watch)),
+    ("/palpate.v1.ViewService/GetBurns", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetMesh", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetTexture", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetTopology", Access::Role(Role::Watch)),

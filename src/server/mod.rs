@@ -4,6 +4,7 @@
 mod address;
 mod admin;
 mod authorize;
+mod burn_parts;
 pub mod catalog;
 mod charged_caller;
 mod cluster_config;

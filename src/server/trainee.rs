@@ -33,7 +33,8 @@ pub(super) const TRAINEE_CALLS: &[(&str, TraineeMay)] = &[
     ("SendCommands", Always),
     ("Touch", Always),
     ("WatchSamples", Always),
-    // What is seen: the surface, its image, and what was severed.
+    // What is seen: the surface, its image, and what was severed or burnt.
+    ("GetBurns", Always),
     ("GetMesh", Always),
     ("GetTexture", Always),
     ("GetTopology", Always),

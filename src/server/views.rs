@@ -10,6 +10,7 @@ use palpate_proto::pb::view_service_server::ViewService;
 use tonic::{Request, Response, Status};
 use tracing::info;
 
+use super::burn_parts::BurnParts;
 use super::charged_caller::ChargedCaller;
 use super::frame_message::frame_messages;
 use super::job_pool::CancelFlag;
@@ -87,6 +88,7 @@ impl ViewService for Views {
     type GetMeshStream = ViewMessages<pb::GetMeshResponse>;
     type GetTopologyStream = ViewMessages<pb::GetTopologyResponse>;
     type GetWoundStream = ViewMessages<pb::GetWoundResponse>;
+    type GetBurnsStream = ViewMessages<pb::GetBurnsResponse>;
     type GetTextureStream = ViewMessages<pb::GetTextureResponse>;
     type WatchFramesStream = ViewMessages<pb::WatchFramesResponse>;
 
@@ -128,6 +130,17 @@ impl ViewService for Views {
         let parts = move |_: &CancelFlag| WoundParts::new(&handle, grid, &request);
         let parts = self.0.job_pool.work(&account, parts).await?;
         Ok(Response::new(in_parts(parts, guard, WoundParts::next)))
+    }
+
+    async fn get_burns(&self, request: Request<pb::GetBurnsRequest>) -> Result<Response<Self::GetBurnsStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let request = request.into_inner();
+        let handle = self.0.seat("GetBurns", &request.session_id).await?.handle;
+        let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
+        let guard = handle.open_stream("GetBurns", StreamKind::ReadsOnly, &account)?;
+        let parts = move |_: &CancelFlag| BurnParts::new(&handle, grid, request.since_version);
+        let parts = self.0.job_pool.work(&account, parts).await?;
+        Ok(Response::new(in_parts(parts, guard, BurnParts::next)))
     }
 
     async fn get_texture(

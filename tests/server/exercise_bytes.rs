@@ -162,6 +162,8 @@ impl Trainee<'_> {
         self.stream("/palpate.v1.ViewService/GetTopology", topology, 1000).await;
         let wound = pb::GetWoundRequest { session_id: session(), ..Default::default() };
         self.stream("/palpate.v1.ViewService/GetWound", wound, 1000).await;
+        let burns = pb::GetBurnsRequest { session_id: session(), ..Default::default() };
+        self.stream("/palpate.v1.ViewService/GetBurns", burns, 1000).await;
         let frames =
             pb::WatchFramesRequest { session_id: session(), encoding: pb::Encoding::F32.into(), ..Default::default() };
         self.stream("/palpate.v1.ViewService/WatchFrames", frames, 1).await;

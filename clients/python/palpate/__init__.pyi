@@ -294,6 +294,8 @@ class Session:
         """Returns the position of each point, m. `out` is an array to write into."""
     def velocities(self, out: Optional[Vectors] = None) -> Vectors:
         """Returns the velocity of each point, m/s. `out` is an array to write into."""
+    def burns(self) -> NDArray[np.float64]:
+        """Returns how burnt each point is by cautery: the time of contact divided by that in which it burns through, 0 to 1."""
     def records(self, points: Optional[Iterable[Point]] = None) -> NDArray[Any]:
         """Returns records of all quantities of the given points, as in `Run.points`; of all points if None."""
     @property

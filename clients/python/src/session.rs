@@ -403,6 +403,17 @@ impl Session {
         self.read(py, out, &read)
     }
 
+    /// Returns how burnt each point is by cautery: the time of contact divided by that in which it burns through, 0 to 1.
+    fn burns<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let burns = self.with(py, |inner| {
+            let tissue = inner.simulation.session.tissue();
+            let mut burns = vec![0.0_f64; tissue.model().len()];
+            tissue.burns().points(tissue.model()).for_each(|burnt| burns[burnt.point.index()] = burnt.burn);
+            burns
+        });
+        column(py, burns)
+    }
+
     /// Returns records of all quantities of the given points, as in `Run.points`; of all points if None.
     #[pyo3(signature = (points=None))]
     fn records<'py>(&self, py: Python<'py>, points: Option<Vec<Bound<'py, PyAny>>>) -> PyResult<Bound<'py, PyAny>> {

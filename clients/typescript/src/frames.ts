@@ -9,6 +9,8 @@ export interface FrameTold {
   timeS: number;
   /** The version of what joins the points: if it is not that of a `Wound`, call `followWound`. */
   topologyVersion: number;
+  /** The version of what is burnt: if it is not that of `Burns`, call `followBurns`. */
+  burnVersion: number;
 }
 
 export class Frames {
@@ -43,7 +45,7 @@ export class Frames {
       this.taken += data.taken;
       this.skipped = before + data.skipped;
       this.server.received.bytes += data.bytes;
-      this.newest = { step: data.step, timeS: data.timeS, topologyVersion: data.topologyVersion };
+      this.newest = { step: data.step, timeS: data.timeS, topologyVersion: data.topologyVersion, burnVersion: data.burnVersion };
       this.onFrame(this.newest);
     };
     worker.onerror = (event) => onFailure({ isGone: false, reason: "", text: event.message || "can't receive frames" }, 0);

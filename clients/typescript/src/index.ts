@@ -1,7 +1,8 @@
 // See and touch tissue from a browser. `Server` provides the calls of the protocol (palpate/v1); `fetchMesh` and
-// `Frames` provide the surface, `followWound` what blades have cut, `watchSamples` what the tools feel, a `Tool` touches, and an `InstrumentTool` leads an
+// `Frames` provide the surface, `followWound` what blades have cut, `followBurns` what tips have burnt, `watchSamples` what the tools feel, a `Tool` touches, and an `InstrumentTool` leads an
 // `Instrument`.
 
+export { Burns, followBurns } from "./burns.js";
 export { Field, type Rectangle } from "./field.js";
 export { Frames, type FrameTold } from "./frames.js";
 export { fetchMesh, meshOf, type MeshData } from "./geometry.js";

@@ -31,6 +31,7 @@ export interface News {
   step: bigint;
   timeS: number;
   topologyVersion: number;
+  burnVersion: number;
   /** Frames that were received, frames that the server skipped since this worker began, and bytes. */
   taken: number;
   skipped: bigint;
@@ -108,9 +109,9 @@ class Intake {
     if (!values || !last || this.taken === 0) return;
     const changed = this.field.takeChanged() ?? { a0: 0, a1: -1, b0: 0, b1: -1 };
     this.field.copyTo(values, changed);
-    const { step, simulationTimeS: timeS, topologyVersion } = last;
+    const { step, simulationTimeS: timeS, topologyVersion, burnVersion } = last;
     const { received } = this.server;
-    const news = { changed, values, step, timeS, topologyVersion, taken: this.taken, skipped: this.skipped.now, bytes: received.bytes };
+    const news = { changed, values, step, timeS, topologyVersion, burnVersion, taken: this.taken, skipped: this.skipped.now, bytes: received.bytes };
     [this.buffer, this.taken, received.bytes] = [undefined, 0, 0];
     page.postMessage(news, [values.buffer]);
   }

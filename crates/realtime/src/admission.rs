@@ -29,11 +29,11 @@ use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::schedule::Schedule;
 use palpate_session::surface::Skin;
-use palpate_tissue::Model;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::scene::{Change, Scene};
 use palpate_tissue::select::scheme_selection;
+use palpate_tissue::{Burns, Model};
 
 /// The state with which a saved or recorded session begins on this server ([`Pacer::resume`]).
 pub struct Begin {
@@ -294,6 +294,7 @@ impl Pacer {
             recovery_count: 0,
             recoveries: Vec::new(),
             cuts: session.tissue().cuts(),
+            burns: session.tissue().burns(),
             ties: session.tissue().ties(),
             awake_points: 0,
             path_counts: [0; 3],
@@ -307,7 +308,7 @@ impl Pacer {
         let mut intake = Intake::new(&first.scene, &self.limits)
             .of_substeps(first.plan.substeps)
             .charged_to(owner)
-            .of_cut_bytes(first.cut_bytes())
+            .of_cut_bytes(first.cut_bytes() + Burns::most_bytes(&first))
             .continued(&session, changed_to);
         if first.scene.cutting.tear_strain.is_some() || !session.tissue().cuts().is_empty() {
             intake.charge_cuts(points_key)?;

@@ -148,6 +148,7 @@ impl SessionTask {
             (status.recovery_count, status.recoveries) = (recovery_count, self.session.recoveries().list());
         }
         status.cuts = self.session.tissue().cuts();
+        status.burns = self.session.tissue().burns();
         status.awake_points = self.session.tissue().awake_points();
         if let Some(times) = self.session.tissue().stage_times() {
             status.stages = times.list();
@@ -182,8 +183,9 @@ impl SessionTask {
             Err(refusal) => return viewers.iter().for_each(|(viewer, _)| viewer.close(refusal.clone())),
         };
         let snapshot = Snapshot::new(&model.scene, self.session.step_count(), self.session.time_s(), displacement_m);
-        let cuts = self.session.tissue().cuts();
-        let snapshot = Arc::new(snapshot.with_skin(self.handle.skin.as_ref()).with_cuts(cuts));
+        let tissue = self.session.tissue();
+        let snapshot = snapshot.with_skin(self.handle.skin.as_ref()).with_cuts(tissue.cuts());
+        let snapshot = Arc::new(snapshot.with_burn_version(tissue.burns().version()));
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
         encoder.post(self.handle.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::clock::Dilation;
 use palpate_session::schedule::Schedule;
 use palpate_tissue::scene::record::{Recovery, StageTime};
-use palpate_tissue::{Cuts, Model, TieState};
+use palpate_tissue::{Burns, Cuts, Model, TieState};
 
 /// Whether a session's simulated time advances. A running session at rest or frozen is [`RunState::Running`] too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,6 +51,8 @@ pub struct Status {
     pub recoveries: Vec<Recovery>,
     /// What blades have severed.
     pub cuts: Cuts,
+    /// What tips have burnt.
+    pub burns: Burns,
     /// The threads and clips, by ascending number, at most 32 steps old.
     pub ties: Vec<TieState>,
     /// Number of points that a step computes now; 0 at rest.

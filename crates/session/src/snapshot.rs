@@ -18,7 +18,7 @@
 //! that may differ.
 //!
 //! **Bytes**: [`MAGIC`], the version of the format, the length of the parts, XXH3-128 of everything else (16
-//! bytes), the parts as `postcard` encodes them, behind them the threads and clips, burns and the energy of cuts if there are any, and the values at the points. All numbers are little-endian. The
+//! bytes), the parts as `postcard` encodes them, behind them the threads and clips, burns, the energy of cuts and the times of burns if there are any, and the values at the points. All numbers are little-endian. The
 //! bytes are equal on every machine and at every width of vectors. The checksum detects damage, but an attacker can
 //! compute it again. So every value is checked when a snapshot is read or restored.
 
@@ -34,8 +34,8 @@ use palpate_haptics::pose_playback::{Path, PathState};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedBurns, SavedFracture, SavedPlan, SavedPoke, SavedTies, SavedTip, SavedTissue,
-    TissueParts, ensure, tool_above, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedBurnTimes, SavedBurns, SavedFracture, SavedPlan, SavedPoke, SavedTies,
+    SavedTip, SavedTissue, TissueParts, ensure, tool_above, unsound,
 };
 use palpate_tissue::scene::record::Recovery;
 use palpate_tissue::{self as tissue, Model, Tissue};
@@ -308,10 +308,18 @@ impl Saved {
                     if rest.is_empty() {
                         ensure(!burns.is_empty(), "burns that can't be read")?;
                     } else {
-                        parts.tissue.fracture = match postcard::take_from_bytes::<SavedFracture>(rest) {
-                            Ok((fracture, [])) if !fracture.is_empty() => fracture,
-                            _ => return Err(unsound("an energy of cuts that can't be read")),
+                        let Ok((fracture, rest)) = postcard::take_from_bytes::<SavedFracture>(rest) else {
+                            return Err(unsound("an energy of cuts that can't be read"));
                         };
+                        if rest.is_empty() {
+                            ensure(!fracture.is_empty(), "an energy of cuts that can't be read")?;
+                        } else {
+                            parts.tissue.burn_times = match postcard::take_from_bytes::<SavedBurnTimes>(rest) {
+                                Ok((times, [])) if !times.is_empty() => times,
+                                _ => return Err(unsound("times of burns that can't be read")),
+                            };
+                        }
+                        parts.tissue.fracture = fracture;
                     }
                     parts.tissue.burns = burns;
                 }
@@ -347,16 +355,22 @@ fn checksum(header: &[u8], content: &[u8]) -> u128 {
 fn encoded(parts: &Parts, values: &[u8]) -> Vec<u8> {
     // Serialization of plain data to memory can't fail.
     let mut bytes_of_parts = postcard::to_stdvec(parts).unwrap_or_default();
-    let TissueParts { ties, burns, fracture, .. } = &parts.tissue;
-    let (has_fracture, has_burns) = (!fracture.is_empty(), !burns.is_empty());
-    if !ties.is_empty() || has_burns || has_fracture {
+    let TissueParts { ties, burns, fracture, burn_times, .. } = &parts.tissue;
+    // Each is written if there is any of it, or of what is behind it.
+    let has_times = !burn_times.is_empty();
+    let has_fracture = has_times || !fracture.is_empty();
+    let has_burns = has_fracture || !burns.is_empty();
+    if has_burns || !ties.is_empty() {
         bytes_of_parts.extend(postcard::to_stdvec(ties).unwrap_or_default());
     }
-    if has_burns || has_fracture {
+    if has_burns {
         bytes_of_parts.extend(postcard::to_stdvec(burns).unwrap_or_default());
     }
     if has_fracture {
         bytes_of_parts.extend(postcard::to_stdvec(fracture).unwrap_or_default());
+    }
+    if has_times {
+        bytes_of_parts.extend(postcard::to_stdvec(burn_times).unwrap_or_default());
     }
     let parts = bytes_of_parts;
     let mut bytes = Vec::with_capacity(HEADER + parts.len() + values.len());

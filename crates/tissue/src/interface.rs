@@ -17,6 +17,7 @@ use crate::scene::tie::Tie;
 use crate::shape::{PointId, PointName};
 use crate::stage_times::StageTimes;
 use crate::tools::applied_force::Push;
+use crate::tools::burns::Burns;
 use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
 use crate::tools::tie::TieState;
@@ -243,6 +244,8 @@ pub trait Tissue: Send {
     /// # Errors
     /// Refuses springs of which the tissue lacks one ([`Reason::OutOfRange`](palpate_refusal::Reason::OutOfRange)); then it severs none.
     fn sever(&mut self, springs: &[ReportedSpring]) -> palpate_refusal::Result<()>;
+    /// Returns what tips have burnt (cautery).
+    fn burns(&self) -> Burns;
     /// Returns the number of points that a step computes now; the others are at rest. 0 if the whole tissue
     /// sleeps.
     fn awake_points(&self) -> usize;

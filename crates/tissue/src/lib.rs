@@ -37,6 +37,7 @@ pub use state::guard;
 pub use state::restore::restored;
 pub use state::tissue_state::at_rest;
 pub use tools::applied_force::Push;
+pub use tools::burns::{Burns, BurntPoint};
 pub use tools::contact::{TangentInput, ToolContact};
 pub use tools::prescribed::Grasp;
 pub use tools::rigid_tip::rigid_tip_work;

@@ -164,6 +164,9 @@ pub struct TissueParts {
     /// The energy that has gone into cuts, behind these.
     #[serde(skip)]
     pub fracture: SavedFracture,
+    /// When what is burnt burns through, behind this.
+    #[serde(skip)]
+    pub burn_times: SavedBurnTimes,
 }
 
 impl TissueParts {
@@ -464,6 +467,22 @@ impl SavedBurns {
     /// Returns whether nothing is burnt.
     pub fn is_empty(&self) -> bool {
         self.now.is_empty() && self.at_checkpoint.is_empty()
+    }
+}
+
+/// In which time each burnt point burns through, s, in the order of [`SavedBurns`], and the version of the burns. Snapshots from before burns
+/// were shown have none.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SavedBurnTimes {
+    pub(crate) version: u32,
+    pub(crate) now_s: Vec<f64>,
+    pub(crate) at_checkpoint_s: Vec<f64>,
+}
+
+impl SavedBurnTimes {
+    /// Returns whether nothing was ever burnt.
+    pub fn is_empty(&self) -> bool {
+        self.version == 0 && self.now_s.is_empty() && self.at_checkpoint_s.is_empty()
     }
 }
 

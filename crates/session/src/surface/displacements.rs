@@ -20,6 +20,8 @@ pub struct Snapshot {
     pub simulation_time_s: f64,
     /// The version of the topology ([`Cuts::version`]).
     pub topology_version: u32,
+    /// The version of what is burnt ([`Burns::version`](palpate_tissue::Burns::version)).
+    pub burn_version: u32,
     /// What is severed.
     cuts: Cuts,
     /// Displacements, m: x, y and z separate. Point [i, j] of a sheet is at i·ny + j; the vertices of a mesh are in
@@ -49,6 +51,7 @@ impl Snapshot {
             step,
             simulation_time_s,
             topology_version: 0,
+            burn_version: 0,
             cuts: Cuts::default(),
             displacement_m,
             skin: None,
@@ -72,6 +75,12 @@ impl Snapshot {
     #[must_use]
     pub fn with_cuts(self, cuts: Cuts) -> Self {
         Snapshot { topology_version: cuts.version(), cuts, ..self }
+    }
+
+    /// Returns this snapshot with the version of what was burnt at its moment.
+    #[must_use]
+    pub fn with_burn_version(self, burn_version: u32) -> Self {
+        Snapshot { burn_version, ..self }
     }
 
     /// Returns what was severed at its moment.

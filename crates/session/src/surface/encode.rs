@@ -57,6 +57,8 @@ pub struct Frame {
     pub simulation_time_s: f64,
     /// The version of the topology then.
     pub topology_version: u32,
+    /// The version of what was burnt then.
+    pub burn_version: u32,
     /// Refinement of the surface.
     pub refinement: Refinement,
     /// Number format of the displacements.
@@ -139,6 +141,7 @@ impl Frame {
             step: 0,
             simulation_time_s: 0.0,
             topology_version: 0,
+            burn_version: 0,
             refinement,
             encoding,
             quanta: Quanta::default(),
@@ -202,8 +205,8 @@ pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
 }
 
 fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
-    let Snapshot { step, simulation_time_s, topology_version, .. } = *snapshot;
-    let mut frame = Frame { step, simulation_time_s, topology_version, ..spent };
+    let Snapshot { step, simulation_time_s, topology_version, burn_version, .. } = *snapshot;
+    let mut frame = Frame { step, simulation_time_s, topology_version, burn_version, ..spent };
     frame.quanta = Quanta::over(frame.encoding, snapshot.box_m(frame.refinement), 0.0);
     let grid = frame.refinement;
     let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points(grid)));

@@ -3,6 +3,7 @@
 //!
 //! Frames carry no normals; viewers compute them: `clients/library/src/surface_view.rs` and `src/render/surface.rs`.
 
+pub mod burns;
 #[cfg(test)]
 mod cut_surface_tests;
 mod displacements;

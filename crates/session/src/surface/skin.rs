@@ -168,6 +168,13 @@ impl Skin {
         !self.bound.is_empty() || !self.in_cells.is_empty()
     }
 
+    /// Returns the places in memory of the corners of the triangle with which the vertex at each place of a frame moves, and their weights,
+    /// which add up to 1; empty if the vertices are the points, and for a solid.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn bound_places(&self) -> impl ExactSizeIterator<Item = ([u32; 3], [f32; 3])> + '_ {
+        self.bound.iter().map(|bound| (bound.corners, bound.weights.map(|weight| weight as f32)))
+    }
+
     /// Returns the surface within the cuts of a solid; empty for other tissues. The newest one is kept.
     pub fn cut_surface(&self, cuts: &Cuts) -> Arc<CutSurface> {
         if self.in_cells.is_empty() || cuts.is_empty() {

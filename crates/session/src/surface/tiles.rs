@@ -41,8 +41,8 @@ pub struct FrameTiles {
     changed: bool,
     /// The newest snapshot. All tiles show it within a quantum.
     now: Arc<Snapshot>,
-    /// The update since which the topology has its version.
-    joined_since: u64,
+    /// The update since which the topology and what is burnt have their versions.
+    versions_since: u64,
     box_m: [[f32; 2]; COMPONENTS],
     quanta: Quanta,
     tiles: Vec<Tile>,
@@ -136,7 +136,7 @@ impl FrameTiles {
             key: snapshot.clone(),
             changed: false,
             now: snapshot.clone(),
-            joined_since: 0,
+            versions_since: 0,
             box_m: *snapshot.box_m(refinement),
             quanta: Quanta::default(),
             tiles: (0..along_x * along_y).map(tile).collect(),
@@ -213,8 +213,9 @@ impl FrameTiles {
 
     /// Makes `snapshot` the newest one.
     fn take_moment(&mut self, snapshot: &Arc<Snapshot>) {
-        if snapshot.topology_version != self.now.topology_version {
-            self.joined_since = self.version;
+        let versions = |of: &Snapshot| [of.topology_version, of.burn_version];
+        if versions(snapshot) != versions(&self.now) {
+            self.versions_since = self.version;
         }
         self.now = snapshot.clone();
     }
@@ -223,12 +224,12 @@ impl FrameTiles {
         self.quanta = Quanta::over(self.encoding, &self.box_m, self.finest_m);
     }
 
-    /// Returns whether any tile was written after version `version`, or the topology has changed since. `None` stands for a viewer
+    /// Returns whether any tile was written after version `version`, or the topology or what is burnt has changed since. `None` stands for a viewer
     /// without a frame: then it is true.
     pub fn is_newer_than(&self, version: Option<u64>) -> bool {
         let used = self.now.used_rows(self.refinement);
         let is_newer = |tile: &Tile| Some(tile.version) > version && tile.area.first_point[0] < used;
-        Some(self.joined_since) > version || self.tiles.iter().any(is_newer)
+        Some(self.versions_since) > version || self.tiles.iter().any(is_newer)
     }
 
     /// Returns a frame of the newest snapshot with the tiles that were written after version `version`; all of them
@@ -255,6 +256,7 @@ impl FrameTiles {
             step: now.step,
             simulation_time_s: now.simulation_time_s,
             topology_version: now.topology_version,
+            burn_version: now.burn_version,
             refinement: *refinement,
             encoding: *encoding,
             quanta: *quanta,

@@ -79,7 +79,7 @@ impl<T: Real> TissueState<T> {
             prescribed: self.prescribed.saved(),
             contacts: self.contacts.saved(),
             ties: self.contacts.ties.saved(),
-            burns: self.contacts.burns.saved(),
+            burns: self.contacts.burns.clone(),
             work: self.work,
             checkpoint: self.checkpoint.clone(),
             inputs: self.inputs.clone(),

@@ -220,7 +220,10 @@ impl<T: Real> TissueState<T> {
         self.known_volume_change.set(None);
         self.applied.clone_from(&checkpoint.applied);
         self.prescribed.clone_from(&checkpoint.prescribed);
+        let mut burns = std::mem::take(&mut self.contacts.burns);
+        burns.go_back_to(&checkpoint.contacts.burns);
         self.contacts.clone_from(&checkpoint.contacts);
+        self.contacts.burns = burns;
         self.work = checkpoint.work;
         self.tables.set_severed(&self.model, &checkpoint.cuts);
         self.tiles.has_severed_anchors = self.tables.severed.anchor_count() > 0;

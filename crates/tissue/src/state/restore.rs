@@ -17,8 +17,8 @@ use crate::kernel::region::sides_of;
 use crate::limits::Limits;
 use crate::memory;
 use crate::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedBurns, SavedCheckpoint, SavedContact, SavedForces, SavedFracture, SavedInput,
-    SavedPrescribed, SavedState, SavedTie, SavedTies, TissueParts, ensure, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedBurnTimes, SavedBurns, SavedCheckpoint, SavedContact, SavedForces,
+    SavedFracture, SavedInput, SavedPrescribed, SavedState, SavedTie, SavedTies, TissueParts, ensure, unsound,
 };
 use crate::scene::{Named, Precision};
 use crate::state::guard::checkpoint::Checkpoint;
@@ -141,7 +141,7 @@ pub(super) struct TypedState<T: Real> {
     pub(super) prescribed: SavedPrescribed,
     pub(super) contacts: Vec<SavedContact>,
     pub(super) ties: Vec<SavedTie>,
-    pub(super) burns: Vec<(u32, u32)>,
+    pub(super) burns: Burns,
     pub(super) work: WorkAccount,
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     pub(super) inputs: Vec<(u64, usize, ToolInput)>,
@@ -202,8 +202,16 @@ impl<T: Real> SavedState for TypedState<T> {
                 at_checkpoint: self.checkpoint.as_ref().map_or_else(Vec::new, |from| from.contacts.ties.saved()),
             },
             burns: SavedBurns {
-                now: self.burns.clone(),
+                now: self.burns.saved(),
                 at_checkpoint: self.checkpoint.as_ref().map_or_else(Vec::new, |from| from.contacts.burns.saved()),
+            },
+            burn_times: SavedBurnTimes {
+                version: self.burns.version(),
+                now_s: self.burns.saved_times(),
+                at_checkpoint_s: self
+                    .checkpoint
+                    .as_ref()
+                    .map_or_else(Vec::new, |from| from.contacts.burns.saved_times()),
             },
             fracture: SavedFracture {
                 now_j: self.cuts.fracture_j(),
@@ -255,7 +263,8 @@ fn restored_as<T: Real>(
     sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
     sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
     sheet.contacts = Contacts::restored((&parts.contacts, &parts.ties.now), model, &checks)?;
-    sheet.contacts.burns = Burns::restored(&parts.burns.now, model)?;
+    let SavedBurnTimes { version, now_s, .. } = &parts.burn_times;
+    sheet.contacts.burns = Burns::restored(&parts.burns.now, now_s, *version, model)?;
     sheet.work = WorkAccount::restored(&parts.work)?;
     sheet.tiles.restore(&parts.tiles)?;
     let fracture_j = checks.number(parts.fracture.now_j)?;
@@ -336,7 +345,8 @@ fn checkpoint_of<T: Real>(
     let fracture_j = checks.number(parts.fracture.at_checkpoint_j)?;
     let cuts = tissue.tables.severed.first(severed, fracture_j, model);
     let mut contacts = Contacts::restored((&saved.contacts, &parts.ties.at_checkpoint), model, checks)?;
-    contacts.burns = Burns::restored(&parts.burns.at_checkpoint, model)?;
+    let SavedBurnTimes { version, at_checkpoint_s, .. } = &parts.burn_times;
+    contacts.burns = Burns::restored(&parts.burns.at_checkpoint, at_checkpoint_s, *version, model)?;
     let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
     contacts.follow_cuts(model, cuts.copies());
     if let Some(copies) = cuts.copies() {

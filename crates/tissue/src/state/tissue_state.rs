@@ -34,6 +34,7 @@ use crate::state::point_reader::PointReader;
 use crate::state::sleep::criterion::add_sleeping;
 use crate::state::sleep::tiles::SleepTiles;
 use crate::tools::applied_force::{Applied, Push};
+use crate::tools::burns::Burns;
 use crate::tools::contact::{Contacts, TangentInput, ToolContact};
 use crate::tools::input::ToolInput;
 use crate::tools::prescribed::{Grasp, Prescribed};
@@ -349,6 +350,10 @@ impl<T: Real> Tissue for TissueState<T> {
 
     fn sever(&mut self, springs: &[ReportedSpring]) -> palpate_refusal::Result<()> {
         self.sever_reported(springs)
+    }
+
+    fn burns(&self) -> Burns {
+        self.contacts.burns.clone()
     }
 
     fn awake_points(&self) -> usize {

@@ -1,38 +1,147 @@
-//! What tips have burnt: how long each point has been under one.
+//! What tips have burnt: how long each point has been under one, and which part that is of the time in which it burns through.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use crate::body::model::Model;
 use crate::saved::ensure;
+use crate::shape::PointId;
 use palpate_refusal::Result;
 
-/// For how many steps each point has been under a tip that burns and touches. Steps have one length, so that the time is exact.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Burns {
-    /// Places in memory, ascending, and their steps, 1 or more.
-    steps: Vec<(u32, u32)>,
+/// A version of burns begins when that of a point reaches another multiple of 1/255: as many levels as a viewer has of a colour.
+const LEVELS: f64 = 255.0;
+
+/// Versions in a snapshot are below this, so that counting on does not overflow.
+const MAX_VERSION: u32 = u32::MAX / 2;
+
+/// A point that has been under a tip that burns and touches.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct BurntPlace {
+    /// Its place in memory.
+    place: u32,
+    /// For how many steps, 1 or more. Steps have one length, so that the time is exact.
+    steps: u32,
+    /// The least `Tip::burn_s` of the tips that have burnt it, s; infinite if none is known.
+    through_s: f64,
+    /// The version of the burns since which it has its level.
+    version: u32,
+}
+
+impl BurntPlace {
+    fn burn(&self, rate_hz: f64) -> f64 {
+        (f64::from(self.steps) / rate_hz / self.through_s).min(1.0)
+    }
+
+    fn level(&self, rate_hz: f64) -> f64 {
+        (LEVELS * self.burn(rate_hz)).floor()
+    }
+}
+
+/// What tips have burnt of a tissue ([`Tissue::burns`](crate::Tissue::burns)). Clones share the list.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Burns {
+    /// By ascending place.
+    places: Arc<Vec<BurntPlace>>,
+    version: u32,
+    /// The version since which points were burnt only, and none became as it was before.
+    grows_since: u32,
+}
+
+/// A burnt point ([`Burns::points`]).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BurntPoint {
+    /// The point.
+    pub point: PointId,
+    /// Its time of contact divided by that in which it burns through, above 0; 1: it has burnt through. Under several tips the shortest time
+    /// counts.
+    pub burn: f64,
+    /// The version of the burns since which a viewer sees it so: its burn has passed no multiple of 1/255 since.
+    pub version: u32,
 }
 
 impl Burns {
-    /// Returns the number of steps for which the point at a place in memory has burnt.
-    pub(crate) fn steps_at(&self, place: usize) -> u32 {
-        self.found(place).map_or(0, |at| self.steps[at].1)
+    /// Returns the version of the burns: 0 while nothing is burnt. It grows by 1 with each step in which the burn of a point reaches another
+    /// multiple of 1/255, and when the guard goes back to before a burn; it never falls.
+    pub fn version(&self) -> u32 {
+        self.version
     }
 
-    /// Adds a step to the point at a place in memory.
+    /// Returns whether a viewer that knows the burns of version `since` needs only those of later versions; otherwise it needs all, because
+    /// since then the guard has undone a burn, or the session was restored.
+    pub fn continues(&self, since: u32) -> bool {
+        (self.grows_since..=self.version).contains(&since)
+    }
+
+    /// Returns whether nothing is burnt.
+    pub fn is_empty(&self) -> bool {
+        self.places.is_empty()
+    }
+
+    /// Returns the burnt points, each once. `model` is that of the tissue.
+    pub fn points<'b>(&'b self, model: &'b Model) -> impl Iterator<Item = BurntPoint> + 'b {
+        let rate_hz = model.scene.stepping.rate_hz;
+        self.places.iter().map(move |burnt| BurntPoint {
+            point: model.point_at(burnt.place as usize),
+            burn: burnt.burn(rate_hz),
+            version: burnt.version,
+        })
+    }
+
+    /// Returns the memory that the burns of a session may take, bytes: its own, those of the guard's checkpoint, of a snapshot, and those
+    /// that others read. 0 for a tissue that is not burnt. `model` is that of the tissue.
+    pub fn most_bytes(model: &Model) -> u64 {
+        const LISTS: u64 = 4;
+        let points = if model.shape().takes_rigid_tips() { 0 } else { model.place_count() };
+        LISTS * points as u64 * size_of::<BurntPlace>() as u64
+    }
+
+    /// Returns the number of steps for which the point at a place in memory has burnt.
+    pub(crate) fn steps_at(&self, place: usize) -> u32 {
+        self.found(place).map_or(0, |at| self.places[at].steps)
+    }
+
+    /// Adds a step to the points at places in memory, each with the time in which it burns through there, s.
     #[allow(clippy::cast_possible_truncation)]
-    pub(crate) fn add_step(&mut self, place: usize) {
-        match self.found(place) {
-            Ok(at) => self.steps[at].1 = self.steps[at].1.saturating_add(1),
-            Err(at) => self.steps.insert(at, (place as u32, 1)),
+    pub(crate) fn add_step(&mut self, under: &BTreeMap<usize, f64>, rate_hz: f64) {
+        let (version, mut is_seen) = (self.version.saturating_add(1), false);
+        for (place, through_s) in under {
+            let found = self.found(*place);
+            let places = Arc::make_mut(&mut self.places);
+            let at = found.unwrap_or_else(|at| {
+                let untouched = BurntPlace { place: *place as u32, steps: 0, through_s: f64::INFINITY, version };
+                places.insert(at, untouched);
+                at
+            });
+            let burnt = &mut places[at];
+            let level = burnt.level(rate_hz);
+            burnt.steps = burnt.steps.saturating_add(1);
+            burnt.through_s = burnt.through_s.min(*through_s);
+            if burnt.level(rate_hz) > level {
+                (burnt.version, is_seen) = (version, true);
+            }
+        }
+        if is_seen {
+            self.version = version;
         }
     }
 
     fn found(&self, place: usize) -> std::result::Result<usize, usize> {
-        self.steps.binary_search_by_key(&place, |burnt| burnt.0 as usize)
+        self.places.binary_search_by_key(&place, |burnt| burnt.place as usize)
+    }
+
+    /// Makes what is burnt that of an earlier state, in a new version if that changes anything.
+    pub(crate) fn go_back_to(&mut self, earlier: &Self) {
+        let state = |burns: &Self| burns.saved().into_iter().zip(burns.saved_times()).collect::<Vec<_>>();
+        if Arc::ptr_eq(&self.places, &earlier.places) || state(self) == state(earlier) {
+            return;
+        }
+        let version = self.version.max(earlier.version).saturating_add(1);
+        *self = Burns { places: earlier.places.clone(), version, grows_since: version };
     }
 
     /// Adds what the next steps depend on to a hash: nothing if nothing is burnt.
     pub(crate) fn hash(&self, add: &mut impl FnMut(&[u8])) {
-        for (place, steps) in &self.steps {
+        for BurntPlace { place, steps, .. } in &*self.places {
             add(&place.to_le_bytes());
             add(&steps.to_le_bytes());
         }
@@ -40,14 +149,26 @@ impl Burns {
 
     /// Returns the places and their steps.
     pub(crate) fn saved(&self) -> Vec<(u32, u32)> {
-        self.steps.clone()
+        self.places.iter().map(|burnt| (burnt.place, burnt.steps)).collect()
     }
 
-    /// Restores what was burnt.
-    pub(crate) fn restored(saved: &[(u32, u32)], model: &Model) -> Result<Self> {
+    /// Returns the time in which the point at each place burns through, s.
+    pub(crate) fn saved_times(&self) -> Vec<f64> {
+        self.places.iter().map(|burnt| burnt.through_s).collect()
+    }
+
+    /// Restores what was burnt, in this version. `times` is empty in snapshots that have none: then no burn is known until the next tip
+    /// touches the point.
+    pub(crate) fn restored(saved: &[(u32, u32)], times: &[f64], version: u32, model: &Model) -> Result<Self> {
         ensure(saved.is_sorted_by(|a, b| a.0 < b.0), "burnt points out of order")?;
         let is_sound = |(place, steps): &(u32, u32)| (*place as usize) < model.place_count() && *steps > 0;
         ensure(saved.iter().all(is_sound), "a burnt point that is not of the tissue")?;
-        Ok(Burns { steps: saved.to_vec() })
+        ensure(times.is_empty() || times.len() == saved.len(), "burnt points without their times")?;
+        ensure(times.iter().all(|through_s| *through_s > 0.0), "a burnt point without a time")?;
+        ensure(version < MAX_VERSION, "a version of the burns beyond what any session has")?;
+        let times = times.iter().copied().chain(std::iter::repeat(f64::INFINITY));
+        let burnt = |(&(place, steps), through_s)| BurntPlace { place, steps, through_s, version };
+        let places = Arc::new(saved.iter().zip(times).map(burnt).collect());
+        Ok(Burns { places, version, grows_since: version })
     }
 }

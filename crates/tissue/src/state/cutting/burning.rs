@@ -6,7 +6,7 @@
 //! (`tearing`). The anchor spring of a point that has burnt for so long is severed too, if anchors can be (`anchors`). Before that, the
 //! tissue does not become stiffer.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 
 use super::Crossing;
 use crate::kernel::real::Real;
@@ -26,9 +26,14 @@ impl<T: Real> TissueState<T> {
             return Vec::new();
         }
         let burns = &mut contacts.burns;
-        // A point under two tips burns once.
-        let places: BTreeSet<usize> = under.iter().flat_map(|(_, places)| places).copied().collect();
-        places.into_iter().for_each(|place| burns.add_step(place));
+        // A point under two tips burns once, and as the quicker one has it.
+        let mut quickest: BTreeMap<usize, f64> = BTreeMap::new();
+        for (burn_s, place) in
+            under.iter().flat_map(|(burn_s, places)| places.iter().map(move |place| (*burn_s, *place)))
+        {
+            quickest.entry(place).and_modify(|least_s| *least_s = least_s.min(burn_s)).or_insert(burn_s);
+        }
+        burns.add_step(&quickest, model.scene.stepping.rate_hz);
         let (mut found, mut through) = (Vec::new(), Vec::new());
         for (burn_s, places) in under {
             let is_through = |place| f64::from(burns.steps_at(place)) / model.scene.stepping.rate_hz >= burn_s;

@@ -9,7 +9,7 @@ use crate::interface::Tissue;
 use crate::limits::Limits;
 use crate::scene::action_check::check_tip;
 use crate::shape::PointId;
-use crate::{Model, at_rest, restored};
+use crate::{Burns, Model, at_rest, restored};
 use palpate_haptics::{ContactState, Tip, TipShape};
 use palpate_refusal::Reason;
 
@@ -204,6 +204,92 @@ fn what_is_burnt_is_kept_by_the_state_that_the_guard_goes_back_to_and_by_a_recov
     assert!(tissue.cuts().is_empty());
     press(&mut tissue, 0.002, tip, 1);
     assert!(!tissue.cuts().is_empty());
+}
+
+#[test]
+fn the_burn_of_a_point_is_its_time_of_contact_as_a_part_of_that_of_the_quickest_tip() {
+    for kind in ["sheet", "surface"] {
+        let model = model(kind, &["stepping.precision=f64"]);
+        let mut tissue = at_rest(&model);
+        let most = |tissue: &dyn Tissue| tissue.burns().points(&model).map(|burnt| burnt.burn).fold(0.0, f64::max);
+        assert!(tissue.burns().is_empty() && tissue.burns().version() == 0 && tissue.burns().continues(0));
+        let tip = burning(0.006);
+        for steps in 1..=BURN_STEPS {
+            touch(&mut *tissue, tip, 1);
+            let burn = f64::from(steps) / f64::from(BURN_STEPS);
+            assert!((most(&*tissue) - burn).abs() < 1e-12 && (steps < BURN_STEPS || most(&*tissue) == 1.0), "{kind}");
+            // Each step is more than 1/255, so that a viewer is told.
+            assert_eq!(tissue.burns().version(), steps, "{kind}");
+        }
+        // It has burnt through: nothing more is seen.
+        touch(&mut *tissue, tip, 5);
+        assert_eq!((most(&*tissue), tissue.burns().version()), (1.0, BURN_STEPS), "{kind}");
+        // Two thirds of a slower tip's time are all of a quicker one's.
+        let mut tissue = at_rest(&model);
+        touch(&mut *tissue, Tip { burn_s: 1.5 * tip.burn_s, ..tip }, BURN_STEPS - 1);
+        assert!((most(&*tissue) - 2.0 / 3.0 * (1.0 - 1.0 / f64::from(BURN_STEPS))).abs() < 1e-12, "{kind}");
+        touch(&mut *tissue, tip, 1);
+        assert_eq!(most(&*tissue), 1.0, "{kind}");
+    }
+}
+
+#[test]
+fn a_slow_burn_has_no_more_versions_than_a_viewer_has_levels() {
+    let model = model("sheet", &["stepping.precision=f64"]);
+    let mut tissue = at_rest(&model);
+    let slow = Tip { grasps: true, burn_s: 1.0, ..burning(0.006) };
+    press(&mut *tissue, 0.002, slow, 1000);
+    let burns = tissue.burns();
+    assert!(burns.points(&model).all(|burnt| burnt.burn == 1.0 && burnt.version == burns.version()));
+    assert_eq!(burns.version(), 255);
+}
+
+#[test]
+fn the_guard_undoes_a_burn_in_a_new_version_that_does_not_continue() {
+    let model = model("sheet", &["stepping.precision=f64"]);
+    let tip = Tip { grasps: true, ..burning(0.006) };
+    let mut tissue = crate::state::tissue_state::TissueState::<f64>::new(&model);
+    press(&mut tissue, 0.002, tip, 10);
+    tissue.take_checkpoint();
+    let at_checkpoint = tissue.burns();
+    press(&mut tissue, 0.002, tip, 10);
+    let later = tissue.burns();
+    assert!(later.continues(at_checkpoint.version()));
+    tissue.go_back(0);
+    let back = tissue.burns();
+    assert!(back.version() > later.version());
+    assert!(!back.continues(later.version()) && !back.continues(at_checkpoint.version()));
+    let burn = |burns: &Burns| burns.points(&model).map(|burnt| (burnt.point, burnt.burn)).collect::<Vec<_>>();
+    assert_eq!(burn(&back), burn(&at_checkpoint));
+    // Where nothing was burnt since, nothing is undone.
+    tissue.go_back(0);
+    assert_eq!(tissue.burns(), back);
+}
+
+#[test]
+fn a_restored_tissue_has_the_burns_in_their_version_and_those_of_an_earlier_format_are_unknown() {
+    let model = model("surface", &["stepping.precision=f64"]);
+    let mut tissue = at_rest(&model);
+    let tip = burning(0.006);
+    press(&mut *tissue, 0.002, tip, 20);
+    let (saved, burns) = (tissue.save().plain(), tissue.burns());
+    let again = restored(&model, &saved.parts, &saved.values, &Limits::default()).unwrap();
+    let burn = |burns: &Burns| burns.points(&model).map(|burnt| (burnt.point, burnt.burn)).collect::<Vec<_>>();
+    assert_eq!((burn(&again.burns()), again.burns().version()), (burn(&burns), burns.version()));
+    // A viewer that knows an earlier version gets all: which points are new is not saved.
+    assert!(again.burns().continues(burns.version()) && !again.burns().continues(burns.version() - 1));
+    let mut parts = saved.parts.clone();
+    parts.burn_times = Default::default();
+    let mut old = restored(&model, &parts, &saved.values, &Limits::default()).unwrap();
+    assert!(old.burns().points(&model).all(|burnt| burnt.burn == 0.0) && !old.burns().is_empty());
+    // It goes on with the same times of contact.
+    press(&mut *old, 0.002, tip, 1);
+    press(&mut *tissue, 0.002, tip, 1);
+    assert_eq!(burn(&old.burns()), burn(&tissue.burns()));
+    for broken in [vec![0.5], vec![-1.0; burns.points(&model).count()], vec![f64::NAN; burns.points(&model).count()]] {
+        parts.burn_times.now_s = broken;
+        assert!(restored(&model, &parts, &saved.values, &Limits::default()).is_err());
+    }
 }
 
 #[test]
