@@ -120,6 +120,7 @@ export class Body implements Surface, WoundedSurface {
     this.isMapped = isSeamless(data);
     this.geometry.setAttribute("uv", new BufferAttribute(this.isMapped ? uv : new Float32Array(2 * count), 2));
     this.geometry.setAttribute("rest", new BufferAttribute(restM, 3));
+    this.geometry.setAttribute("burn", new BufferAttribute(new Float32Array(count), 1).setUsage(DynamicDrawUsage));
     this.geometry.setIndex(new BufferAttribute(triangles, 1));
     const { edges, isOpen } = edgesOf(triangles, count);
     this.isOpen = isOpen;
@@ -349,6 +350,13 @@ export class Body implements Surface, WoundedSurface {
       }
       from = to;
     }
+  }
+
+  showBurns(burn: Float32Array): void {
+    const attribute = this.geometry.getAttribute("burn") as BufferAttribute;
+    attribute.array.set(burn.subarray(0, this.count));
+    attribute.needsUpdate = true;
+    this.wound.showBurns();
   }
 
   takeMoved(): number {

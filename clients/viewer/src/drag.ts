@@ -7,7 +7,7 @@ import type { Place, Surface } from "./surface";
 
 /** Returns whether the tool moves to the places under the drag. */
 export function glides({ mode, grasper }: Hand): boolean {
-  return mode === "stroke" || mode === "tip" || mode === "blade" || (mode === "grasper" && !grasper.grips);
+  return mode === "stroke" || mode === "tip" || mode === "blade" || mode === "cautery" || (mode === "grasper" && !grasper.grips);
 }
 
 export class Drag {

@@ -2,7 +2,8 @@
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
 // stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and moves it with
-// the drag. A tip is held at a depth, and glides. A blade stands upright at a depth, and cuts along the drag. A grasper (grasper.ts) has several tools. A place has a side on which
+// the drag. A tip is held at a depth, and glides. A blade stands upright at a depth, and cuts along the drag.
+// A cautery is a small tip that burns what it touches for long enough. A grasper (grasper.ts) has several tools. A place has a side on which
 // it is touched, and pushes go into the tissue from there. A parked tool stays where it is, as a held instrument does.
 
 import { type Action, type Lead, plus, Tool, type Vec3, type Wanted } from "palpate";
@@ -12,12 +13,16 @@ import { Grasper, type View } from "./grasper";
 import { server } from "./server";
 import type { Place, Surface } from "./surface";
 
-export type Mode = "push" | "pull" | "stroke" | "tip" | "blade" | "grasper" | "thread" | "clip";
+export type Mode = "push" | "pull" | "stroke" | "tip" | "blade" | "cautery" | "grasper" | "thread" | "clip";
 
 /** Length of a blade's edge, in depths of the deepest cut: it reaches out of the tissue, also of one that gives way. */
 const EDGE = 2;
 /** How far around its edge a blade feels the surface, in falloff lengths. */
 const BLADE = 0.3;
+/** Radius of a cautery in falloff lengths, and its depth in depths of a tip. */
+const CAUTERY = { radius: 0.6, depth: 0.4 };
+/** Time of contact after which a cautery severs the tissue, s. */
+export const BURN_S = 0.6;
 
 /** A tip moves down from beside the tissue in this time, so that the server knows from which side it comes. */
 const SINK_MS = 250;
@@ -38,6 +43,8 @@ export interface Reach {
   tipShape: TipShape;
   /** Number of tips of a grasper's jaw: on a mesh, each takes much time to compute. */
   jawTips: number;
+  /** Whether a cautery burns the tissue: a solid is not burnt. */
+  canBurn: boolean;
 }
 
 export class Hand {
@@ -95,7 +102,7 @@ export class Hand {
     const former = this.tool;
     this.isLeft = false;
     former.rest();
-    this.chosen = mode;
+    this.chosen = mode === "cautery" && !this.reach.canBurn ? "tip" : mode;
     if (former !== this.tool) this.tool.takeAfter(former.letGo());
   }
 
@@ -158,14 +165,20 @@ export class Hand {
     return { tool: this.tool.tool, tipM: positionM, edgeM };
   }
 
-  /** Whether poses lead it: it is at a depth, and glides. */
-  get isPosed(): boolean {
-    return this.mode === "tip" || this.mode === "blade" || this.mode === "grasper";
+  /** Whether it severs what it touches. */
+  get severs(): boolean {
+    return this.mode === "blade" || this.mode === "cautery";
   }
 
-  /** Depth of a tip, a blade or of open jaws, which are thinner, m. */
+  /** Whether poses lead it: it is at a depth, and glides. */
+  get isPosed(): boolean {
+    return this.mode === "tip" || this.mode === "blade" || this.mode === "cautery" || this.mode === "grasper";
+  }
+
+  /** Depth of a tip, a blade, a cautery or of open jaws, which are thinner, m. */
   get depthM(): number {
-    return (this.mode === "grasper" ? 0.5 : 1) * this.strength * this.reach.depthM;
+    const part = this.mode === "grasper" ? 0.5 : this.mode === "cautery" ? CAUTERY.depth : 1;
+    return part * this.strength * this.reach.depthM;
   }
 
   /** Target depth of the tip, once it has had the time to get there; undefined if no tip is used. */
@@ -263,6 +276,7 @@ export class Hand {
   private tip({ restM, outward }: Place, now: number): Lead {
     const { lengthM, depthM, tipShape } = this.reach;
     const positionM = plus(restM, outward, this.outM(now));
+    if (this.mode === "cautery") return { positionM, radiusM: CAUTERY.radius * lengthM, shape: TipShape.DISC, burnS: BURN_S };
     if (this.mode !== "blade") return { positionM, radiusM: lengthM, shape: tipShape };
     const edgeM = plus([0, 0, 0], outward, EDGE * depthM);
     const bladeM = plus(positionM, this.shiftedM);

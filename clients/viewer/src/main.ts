@@ -19,7 +19,7 @@ import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { Lumps } from "./lumps";
-import { cutText, feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, undoText, wayText, wellText } from "./messages";
+import { cauteryText, cutText, feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, undoText, wayText, wellText } from "./messages";
 import { Overlay, type ToolLabel } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, withSession, writeAddress, writeMoment } from "./page";
 import { pageState } from "./page-state";
@@ -503,7 +503,11 @@ function tellControls(): void {
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(shownSession.refinement);
   part("meaning", HTMLElement).textContent = meaningText(shownSession);
-  for (const choice of modeChoices()) choice.checked = choice.value === shownSession.hand.mode;
+  for (const choice of modeChoices()) {
+    choice.checked = choice.value === shownSession.hand.mode;
+    if (choice.value === "cautery") choice.disabled = !shownSession.reach.canBurn;
+  }
+  part("cautery-part", HTMLElement).title = cauteryText(shownSession);
   part("strength", HTMLInputElement).value = String(shownSession.hand.strength);
   part("strength-part", HTMLElement).hidden = sews(shownSession.hand.mode);
   part("view", HTMLElement).classList.toggle("sews", sews(shownSession.hand.mode));

@@ -142,15 +142,18 @@ export class Skin extends ShaderMaterial {
         varying float vInner;
         #endif
         attribute float open;
+        attribute float burn;
         varying vec3 vAt;
         varying vec3 vNormal;
         varying vec2 vUv;
         varying float vOpen;
+        varying float vBurn;
         void main() {
           vAt = position;
           vNormal = normal;
           vUv = uv;
           vOpen = open;
+          vBurn = burn;
           #ifdef BODY
           vRest = rest;
           vRestNormal = restNormal;
@@ -169,6 +172,7 @@ export class Skin extends ShaderMaterial {
         varying vec3 vNormal;
         varying vec2 vUv;
         varying float vOpen;
+        varying float vBurn;
         ${isBody ? BODY : SHEET}
         ${SHADOW}
         void main() {
@@ -178,6 +182,9 @@ export class Skin extends ShaderMaterial {
           // would be black.
           if (!gl_FrontFacing && isTurned()) n = -n;
           vec3 colour = mix(tone, image(), mapped);
+          // Burnt tissue turns brown, then black, and is dry: it no longer shines.
+          float dry = 1.0 - smoothstep(0.0, 0.5, vBurn);
+          colour = mix(colour, mix(vec3(0.16, 0.055, 0.025), vec3(0.012, 0.010, 0.009), smoothstep(0.4, 1.0, vBurn)), smoothstep(0.0, 0.6, vBurn));
           float open = openness(dot(n, eye));
           float inside = within(open);
           float share = lit(vAt);
@@ -210,7 +217,7 @@ export class Skin extends ShaderMaterial {
           float sky = (0.30 * smoothstep(0.15, 0.9, seen.z) + 0.85 * window_(seen, lamp) * share * (1.0 - inside)) * (0.25 + 2.4 * mirror);
           float inner = max(dot(n, eye), 0.0);
           glint = glint * (1.0 - inside) + 0.35 * min(scope, 1.0) * smoothstep(0.985, 0.9985, inner);
-          shown += (glint * glints(n) * share + 0.16 * sky * open) * near * vec3(1.0, 0.98, 0.95);
+          shown += dry * (glint * glints(n) * share + 0.16 * sky * open) * near * vec3(1.0, 0.98, 0.95);
           for (int i = 0; i <= ${SHADOWS}; i++) if (rings[i].w > 0.0) {
             float off = abs(length(vAt - rings[i].xyz) / rings[i].w - 1.0);
             shown = mix(shown, ink, (i < ${SHADOWS} ? 0.35 : 0.9) * (1.0 - smoothstep(0.03, 0.09, off)));

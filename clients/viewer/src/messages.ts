@@ -3,7 +3,7 @@
 import { type Session, SessionState, TipShape } from "palpate/v1";
 import { depthText, jawsText, type ToolLabel } from "./overlay";
 import { quantity } from "./plot";
-import type { Hand, Mode } from "./hand";
+import { BURN_S, type Hand, type Mode } from "./hand";
 import type { Told } from "./samples";
 import type { ShownSession } from "./session";
 
@@ -46,7 +46,7 @@ export function refusedText(message: string, reason: string, { session }: ShownS
 
 /** Returns whether the strength of a tool is its depth. */
 export function isDeep(mode: Mode): boolean {
-  return mode === "tip" || mode === "blade" || mode === "grasper";
+  return mode === "tip" || mode === "blade" || mode === "cautery" || mode === "grasper";
 }
 
 /** Describes the strength of the present tool. */
@@ -66,6 +66,12 @@ export function meaningText({ hand, reach, surface }: ShownSession): string {
     return (
       "The blade stands upright in the tissue and cuts where you drag it. Depth is how far its point goes below the tissue at rest. " +
       "What pushes back is what cutting takes, if the tissue has a toughness; a tissue with a pretension gapes."
+    );
+  }
+  if (hand.mode === "cautery") {
+    return (
+      `The cautery burns what it touches: the tissue turns dark, and is severed after ${quantity(BURN_S, "s")} of contact in all. Depth is how far ` +
+      "its tip goes below the tissue at rest."
     );
   }
   if (hand.mode === "grasper") {
@@ -106,6 +112,11 @@ export function feltText({ hands, hand }: ShownSession, labels: readonly ToolLab
 function toldText(told: Told, verb: string): string {
   const force = `${verb}${quantity(told.allN, "N")}${verb === "" ? " back" : ""}`;
   return [depthText(told), force, jawsText(told)].filter((text) => text !== "").join(", ");
+}
+
+/** Says what a cautery does, or that there is none for this tissue. */
+export function cauteryText({ reach: { canBurn } }: ShownSession): string {
+  return canBurn ? "A small tip that burns what it touches: it turns dark, and is severed" : "Only sheets and surfaces are burnt, not a solid";
 }
 
 /** Describes what blades have cut, as far as it is known here; undefined if nothing is. */

@@ -1,6 +1,6 @@
 // State of the page, for tests and measurements: `window.palpate`.
 
-import { norm, vec } from "palpate";
+import { Burns, norm, vec } from "palpate";
 import type { Comparison } from "./comparison";
 import type { ExercisePanel } from "./exercise";
 import type { Latency } from "./latency";
@@ -78,6 +78,11 @@ export function pageState(present: () => ShownSession | undefined, { stage, play
       const { session, wound, surface } = present() ?? {};
       const { shown, waiting, cutFaces } = surface?.wound.count ?? { shown: 0, waiting: 0, cutFaces: 0 };
       return { cutFaces, severed: session?.severed ?? 0, pieces: session?.pieces ?? 0, version: wound?.version ?? 0, vertices: wound?.vertices.length ?? 0, shown, waiting, mostAtOnce: surface?.wound.mostAtOnce ?? 0 };
+    },
+    /** What tips have burnt, as it is drawn. */
+    get burns() {
+      const { version, burn } = present()?.burning.burns ?? new Burns(0);
+      return { version, burnt: burn.filter((of) => of > 0).length, through: burn.filter((of) => of >= 1).length };
     },
     /** The longest times since the last look that the page has worked on a picture, and on a change of the wound, ms. */
     takeLongest(): { pictureMs: number; woundMs: number } {

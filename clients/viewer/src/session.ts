@@ -1,6 +1,7 @@
 // The session that the page shows: its streams, its surface and the hands, until the user leaves it.
 
 import { Body } from "./body";
+import { Burning } from "./burning";
 import { fingerM } from "./coefficients";
 import { isBarred } from "./token-form";
 import { fetchMesh, followWound, Frames, type FrameTold, type MeshData, norm, plus, type Vec3, Wound } from "palpate";
@@ -46,7 +47,7 @@ export interface Told {
   onWell: () => void;
   /** A frame has arrived. */
   onFrame: () => void;
-  /** What blades have cut has changed as it is drawn. */
+  /** What blades have cut, or tips burnt, has changed as it is drawn. */
   onCut: () => void;
   /** What the caller may no longer do: the server's reason. */
   onBarred: (reason: string) => void;
@@ -83,6 +84,8 @@ export class ShownSession {
   private readonly mesh: MeshData | undefined;
   /** What blades have cut of the surface, as far as it is known here. */
   wound: Wound;
+  /** What tips have burnt of it. */
+  readonly burning: Burning;
   /** The longest time that the page has worked on one change of the wound, ms. */
   longestCutMs = 0;
   /** The newest version of the topology that the server has told of. */
@@ -134,7 +137,8 @@ export class ShownSession {
     this.rateHz = session.scene?.stepping?.rateHz ?? 1000;
     const k = session.scene?.springs?.stiffnessNPerM ?? 0;
     const anchor = session.scene?.anchorSprings?.stiffnessNPerM ?? 0;
-    const tipShape = session.scene?.solid ? TipShape.RIGID_DISC : TipShape.DISC;
+    const canBurn = session.scene?.solid === undefined;
+    const tipShape = canBurn ? TipShape.DISC : TipShape.RIGID_DISC;
     if (mesh) {
       const sizeM = boxOf(mesh);
       const lengthM = fingerM(sizeM, mesh.edgeM);
@@ -144,13 +148,13 @@ export class ShownSession {
       const { sum } = this.surface.push(this.surface.middle(), lengthM);
       // If the springs of a tissue differ, no such force can be given.
       const mostN = rounded(sum * aPointN || 2);
-      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape, jawTips: 1 };
+      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape, jawTips: 1, canBurn };
       this.widthM = sizeM;
     } else {
       // A push falls off over a spacing, so that a few points share it: its depth is about two spacings.
       const lengthM = grid?.spacingM ?? 1;
       const mostN = 2 * lengthM * (2 * k + anchor) || lengthM;
-      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape, jawTips: 3 };
+      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape, jawTips: 3, canBurn };
       this.widthM = (this.points[0] - 1) * lengthM;
     }
     // A mesh is shown with its own vertices.
@@ -165,6 +169,7 @@ export class ShownSession {
     this.wound = this.newWound();
     this.hasFormerWound = former !== undefined && (former.hasFormerWound || former.wound.version > 0);
     this.cutVersion = session.topologyVersion;
+    this.burning = new Burning(session.sessionId, this.surface, this.refinement, former !== undefined, this.ended.signal, () => this.told.onCut());
     this.beforeCuts = session.playback ? [] : (former?.beforeCuts ?? []);
     this.frames.onFrame = (frame) => this.framed(frame);
     this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool), (tools) => this.joined(tools));
@@ -237,6 +242,7 @@ export class ShownSession {
     void this.ask();
     this.look();
     void this.followCuts();
+    this.burning.heard(0);
   }
 
   private framed(frame: FrameTold): void {
@@ -244,6 +250,7 @@ export class ShownSession {
     this.noteMoment(frame);
     this.cutVersion = Math.max(this.cutVersion, frame.topologyVersion);
     void this.followCuts();
+    this.burning.heard(frame.burnVersion);
   }
 
   /** Asks for what blades have cut since, one request at a time, until it is as new as what the server has told of. */
@@ -281,7 +288,7 @@ export class ShownSession {
     this.frame = frame;
     if (!before || frame.topologyVersion <= before.topologyVersion) return;
     // A drag is one cut, however long it rests between.
-    const press = this.hands.both.findIndex((hand) => hand.mode === "blade" && hand.holds);
+    const press = this.hands.both.findIndex((hand) => hand.severs && hand.holds);
     const drag = press < 0 ? undefined : `${press} ${this.hands.both[press]!.presses}`;
     const isSameDrag = drag !== undefined && drag === this.cutDrag;
     const isNew = frame.timeS - this.cutS > ONE_CUT_S && !isSameDrag;
@@ -295,7 +302,7 @@ export class ShownSession {
   private noteCutters(before: Session, now: Session): void {
     if (now.severed <= before.severed) return;
     const { both } = this.hands;
-    if (both.some((hand) => hand.mode === "blade" && hand.holds)) return void this.cutters.add("you");
+    if (both.some((hand) => hand.severs && hand.holds)) return void this.cutters.add("you");
     for (const { tool, holder } of now.heldTools) if (!this.hands.of(tool) && this.cutters.size < MAX_CUTTERS) this.cutters.add(holder || "somebody");
   }
 
@@ -334,6 +341,7 @@ export class ShownSession {
     this.surface = this.newSheet();
     this.wound = this.newWound();
     void this.followCuts();
+    this.burning.refine(this.surface, n);
     if (!this.seen.signal.aborted) this.watch();
     return this.surface;
   }

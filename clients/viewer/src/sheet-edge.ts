@@ -79,6 +79,7 @@ export class SheetEdge {
     this.geometry.setAttribute("position", this.position);
     this.geometry.setAttribute("normal", this.normal);
     this.geometry.setAttribute("open", new BufferAttribute(open, 1));
+    this.geometry.setAttribute("burn", new BufferAttribute(new Float32Array(columns * ROWS), 1));
     this.geometry.setAttribute("uv", new BufferAttribute(uv, 2));
     this.geometry.setIndex(triangles);
   }
@@ -91,6 +92,15 @@ export class SheetEdge {
     const isLast = row === ROWS - 1;
     const downM = isLast ? heightM : r + 0.45 * (heightM - r);
     return { outM: isLast ? 0.8 * r : 1.0 * r, downM, angle: isLast ? 1.8 : 1.62, arcM: (Math.PI / 2 - 1) * r + downM };
+  }
+
+  /** Is as burnt as the edge of the sheet, less from row to row. `burn` has that of each drawn vertex. */
+  showBurns(burn: ArrayLike<number>): void {
+    const attribute = this.geometry.getAttribute("burn") as BufferAttribute;
+    this.sources.forEach((source, column) => {
+      for (let row = 0; row < ROWS; row++) attribute.array[row * this.sources.length + column] = (1 - row / ROWS) * burn[source]!;
+    });
+    attribute.needsUpdate = true;
   }
 
   /** Moves with the edge of the sheet. */

@@ -49,6 +49,9 @@ export class Sheet implements Surface, WoundedSurface {
   private normal = this.position;
   /** Fraction of ambient light that reaches each vertex: less in a dent. */
   private open = this.position;
+  /** How burnt each drawn vertex is, and each of all; none is before the first burn. */
+  private burn = this.position;
+  private burns: Float32Array = new Float32Array();
   private readonly found = new Vector3();
   private readonly spanM: readonly [number, number];
   /** The largest movement of a drawn vertex along an axis since `takeMoved`, m, if each refresh adds its largest. */
@@ -88,6 +91,7 @@ export class Sheet implements Surface, WoundedSurface {
     this.position = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
     this.normal = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
     this.open = new BufferAttribute(new Float32Array(mx * my), 1).setUsage(DynamicDrawUsage);
+    this.burn = new BufferAttribute(new Float32Array(mx * my), 1).setUsage(DynamicDrawUsage);
     const uv = new Float32Array(2 * mx * my);
     for (let a = 0, i = 0; a < mx; a++) {
       for (let b = 0; b < my; b++, i++) {
@@ -105,11 +109,13 @@ export class Sheet implements Surface, WoundedSurface {
     this.geometry.setAttribute("position", this.position);
     this.geometry.setAttribute("normal", this.normal);
     this.geometry.setAttribute("open", this.open);
+    this.geometry.setAttribute("burn", this.burn);
     this.geometry.setAttribute("uv", new BufferAttribute(uv, 2));
     this.geometry.setIndex(new BufferAttribute(triangles, 1).setUsage(DynamicDrawUsage));
     this.lines.setAttribute("position", this.position);
     this.lines.setIndex(new BufferAttribute(gridLines(rows, columns, this.pointEvery), 1));
     this.edge.begin(this.position, this.normal, mx, my);
+    this.dressBurns();
     this.work({ a0: 0, a1: mx - 1, b0: 0, b1: my - 1 });
     this.wound.rebuild();
     return true;
@@ -164,6 +170,20 @@ export class Sheet implements Surface, WoundedSurface {
     const before = this.every;
     this.every = 0;
     this.drawEvery(before);
+  }
+
+  showBurns(burn: Float32Array): void {
+    this.burns = burn;
+    this.dressBurns();
+    this.wound.showBurns();
+  }
+
+  private dressBurns(): void {
+    if (this.burns.length === 0) return;
+    const [to, { rows, columns, burns }, { ny }] = [this.burn.array, this, this.field];
+    for (let a = 0, i = 0; a < rows.length; a++) for (const column of columns) to[i++] = burns[rows[a]! * ny + column]!;
+    this.burn.needsUpdate = true;
+    this.edge.showBurns(to);
   }
 
   /** Updates positions and normals of what changed since the last picture. Call this before each picture. */

@@ -40,7 +40,7 @@ export interface Surface extends WoundedSurface {
   /** Displacements as the server sent them. */
   readonly field: Field;
   /**
-   * Geometry of the triangles: the attributes `position`, `normal` and `open`, and others that its material needs.
+   * Geometry of the triangles: the attributes `position`, `normal`, `open` and `burn`, and others that its material needs.
    */
   readonly geometry: BufferGeometry;
   /** Geometry of the lines between mass points. */
@@ -65,6 +65,8 @@ export interface Surface extends WoundedSurface {
    * is left for the next one.
    */
   refresh(): boolean;
+  /** Shows how burnt each vertex of the mesh is, 0 to 1. */
+  showBurns(burn: Float32Array): void;
   /** Returns how far vertices moved since the last call, at most, m. */
   takeMoved(): number;
   /** Returns the largest displacement of any vertex, m. */

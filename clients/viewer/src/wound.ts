@@ -39,7 +39,7 @@ export interface WoundedSurface {
 }
 
 /** Attributes of a surface that its material needs, and their sizes. */
-const SIZES: Record<string, number> = { position: 3, normal: 3, open: 1, uv: 2, rest: 3, restNormal: 3, inner: 1 };
+const SIZES: Record<string, number> = { position: 3, normal: 3, open: 1, burn: 1, uv: 2, rest: 3, restNormal: 3, inner: 1 };
 
 export class ShownWound {
   /** The parts of cut triangles, the tissue between the lips, and lines along these. */
@@ -180,10 +180,20 @@ export class ShownWound {
 
   /** Gives a drawn vertex what does not move: its place in the texture, and at rest. */
   private dress(slot: number): void {
+    this.mix(slot, ["uv", "rest", "restNormal", "burn"]);
+  }
+
+  /** The surface is burnt in another way. */
+  showBurns(): void {
+    for (let slot = 0; slot < this.vertexOf.length; slot++) this.mix(slot, ["burn"]);
+  }
+
+  /** Gives a drawn vertex its part of attributes of the surface. */
+  private mix(slot: number, names: readonly string[]): void {
     const { surface } = this;
     const lip = this.lip(slot);
     const drawn = { ...lip, host: surface.drawnVertex(lip.host), second: surface.drawnVertex(lip.second), third: surface.drawnVertex(lip.third) };
-    for (const name of ["uv", "rest", "restNormal"]) {
+    for (const name of names) {
       const [to, from] = [this.parts.getAttribute(name), surface.geometry.getAttribute(name)];
       if (!to || !from) continue;
       for (let c = 0; c < to.itemSize; c++) to.array[to.itemSize * slot + c] = mixed(drawn, from.array, to.itemSize, c);

@@ -257,6 +257,7 @@ export class Server {
  *   camera: number[],
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
  *   wound: { severed: number, pieces: number, version: number, vertices: number, shown: number, waiting: number, cutFaces: number, mostAtOnce: number },
+ *   burns: { version: number, burnt: number, through: number },
  *   sewing: { ties: { number: number, kind: string | undefined, lengthM: number, pathM: number, tensionN: number, broken: boolean }[], picked: number },
  *   takeLongest: () => { pictureMs: number, woundMs: number },
  *   comparison: { isOpen: boolean, curves: number, relativeRms: number },
