@@ -6,6 +6,8 @@
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 
+#[path = "../tests/common/closed_mesh.rs"]
+mod closed_mesh;
 #[path = "../tests/common/random_scenes.rs"]
 mod random_scenes;
 mod report;

@@ -15,6 +15,8 @@
 mod cases;
 #[path = "common/counting.rs"]
 mod counting;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 #[path = "common/moved.rs"]
 mod moved;
 

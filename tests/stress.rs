@@ -8,8 +8,8 @@
 
 use crate::common;
 use crate::common::cases;
+use crate::common::closed_mesh::closed_mesh;
 use crate::common::random_scenes;
-use crate::common::random_scenes::closed_mesh::closed_mesh;
 use crate::common::random_scenes::solid_case;
 use crate::common::{SMALL, model, scene_with};
 use glam::DVec3;

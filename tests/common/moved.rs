@@ -1,9 +1,6 @@
 //! A session as one server hands it to another, or a client sends it: as a journal of one snapshot, in requests.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
-#[path = "journal_opening.rs"]
-mod journal_opening;
-
 use std::io::Cursor;
 use std::sync::Arc;
 
@@ -16,6 +13,8 @@ use palpate_session::journal::{JournalReader, JournalWriter, Opening, pb as kept
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use prost::Message;
+
+use super::journal_opening;
 
 /// Bytes in one message.
 const PART_BYTES: usize = 256 << 10;

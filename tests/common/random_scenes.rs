@@ -11,10 +11,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::script::Script;
 
-#[path = "closed_mesh.rs"]
-pub mod closed_mesh;
-
-use closed_mesh::closed_mesh;
+use super::closed_mesh::closed_mesh;
 
 /// A scene and a script as files say them, and what they are in short.
 pub struct RandomScene {

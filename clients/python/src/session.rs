@@ -18,7 +18,7 @@ use palpate_tissue::shape::PointId;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
-use crate::arrays::{OF_POINT, add_point, records, rows, vector, write_into};
+use crate::arrays::{OF_POINT, add_point, column, records, rows, vector, write_into};
 use crate::error::{failed, refused, wrong};
 use crate::scene::{Scene, Tissue, limits, point};
 use crate::tip::Tip;
