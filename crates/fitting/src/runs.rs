@@ -13,8 +13,10 @@ use super::options::{FitOptions, FitProgress};
 use super::parallel::in_parallel;
 use super::residual::{differences, rms};
 
-/// How many times the substeps of the given scene a run may have: a stiffer or more viscous tissue is not looked at.
+/// How many times the substeps of the given scene a run may have: a stiffer or more viscous tissue is not looked at. A scene of few
+/// substeps counts as one of so many: it may be the softest and least viscous of all that are looked at.
 const MAX_SLOWER: u32 = 32;
+const FEW: u32 = 8;
 
 /// The presses of all curves, which are run on tissues like a model.
 pub(crate) struct Runs<'f> {
@@ -74,7 +76,7 @@ impl Runs<'_> {
 
     /// Returns the limits of a run that may have so many times the substeps of one of the search.
     fn narrower(&self, times: u32) -> Limits {
-        let most = self.model.plan.substeps.saturating_mul(MAX_SLOWER * times);
+        let most = self.model.plan.substeps.max(FEW).saturating_mul(MAX_SLOWER * times);
         Limits { substeps: most.min(self.options.limits.substeps), ..self.options.limits.clone() }
     }
 

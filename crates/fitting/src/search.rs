@@ -21,8 +21,8 @@ const MAX_EVALUATIONS: usize = 15;
 /// How far the first step may go. Each number is on a scale on which 1 is much, whatever depends on it.
 const STEP_BOUND: f64 = 1.5;
 
-/// The Jacobian of the last step stands for that of the minimum if the numbers differ by no more.
-const SAME: f64 = 0.02;
+/// The last Jacobian stands for that of another place if the numbers differ by no more.
+const SAME: f64 = 0.1;
 
 /// Evaluates the function at several places at once, in the way in which it is evaluated at the first argument; `None` where it has no
 /// value.
@@ -57,6 +57,9 @@ struct Problem<'p, 'm, E> {
     steps: &'m [[[f64; 2]; 2]],
     x: DVector<f64>,
     predicted: Option<Vec<f64>>,
+    /// The function beside `x`, for the derivative by the first number: it is evaluated together with that at `x`, which would leave other
+    /// threads idle.
+    beside_first: Option<Vec<f64>>,
     predict: RefCell<&'m mut Predict<'p, E>>,
     /// Where it was differentiated last.
     newest: RefCell<Option<Differentiated>>,
@@ -76,6 +79,19 @@ impl<E> Problem<'_, '_, E> {
         vec![None; places.len()]
     }
 
+    /// Returns the place at which a number is differentiated on one side.
+    fn beside(&self, number: usize, side: usize) -> Vec<f64> {
+        let mut place = self.x.as_slice().to_vec();
+        place[number] += self.steps[number][side][0];
+        place
+    }
+
+    /// Returns what is known of a place at which the last Jacobian stands for the present one.
+    fn known(&self) -> Option<DMatrix<f64>> {
+        let newest = self.newest.borrow();
+        newest.as_ref().filter(|(x, ..)| (x - &self.x).amax() < SAME).map(|(.., jacobian)| jacobian.clone())
+    }
+
     /// Returns the derivatives at the present place by differences, to the other side where there is no value on the first one; NaN where
     /// there is none on either.
     fn derivatives(&self) -> Option<DMatrix<f64>> {
@@ -83,16 +99,14 @@ impl<E> Problem<'_, '_, E> {
         let mut jacobian = DMatrix::from_element(here.len(), self.steps.len(), f64::NAN);
         let mut missing: Vec<usize> = (0..self.steps.len()).collect();
         for side in 0..2 {
-            let beside = |number: &usize| {
-                let mut place = self.x.as_slice().to_vec();
-                place[*number] += self.steps[*number][side][0];
-                place
-            };
-            let values = if missing.is_empty() {
+            let first = self.beside_first.clone().filter(|_| side == 0);
+            let called = &missing[usize::from(first.is_some())..];
+            let values = if called.is_empty() {
                 Vec::new()
             } else {
-                self.call(&missing.iter().map(beside).collect::<Vec<_>>())
+                self.call(&called.iter().map(|number| self.beside(*number, side)).collect::<Vec<_>>())
             };
+            let values = first.map(Some).into_iter().chain(values);
             for (number, value) in std::mem::take(&mut missing).into_iter().zip(values) {
                 let Some(value) = value else {
                     missing.push(number);
@@ -120,7 +134,15 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
         self.x.copy_from(x);
         // A step that was in vain leads back to where it began.
         let known = self.newest.borrow().as_ref().filter(|(at, ..)| at == x).map(|(_, predicted, _)| predicted.clone());
-        self.predicted = known.or_else(|| self.call(&[x.as_slice().to_vec()]).pop().flatten());
+        if known.is_some() {
+            (self.predicted, self.beside_first) = (known, None);
+            return;
+        }
+        let beside = (!self.steps.is_empty()).then(|| self.beside(0, 0));
+        let places: Vec<_> = [x.as_slice().to_vec()].into_iter().chain(beside).collect();
+        let mut values = self.call(&places).into_iter();
+        self.predicted = values.next().flatten();
+        self.beside_first = values.next().flatten();
     }
 
     fn params(&self) -> DVector<f64> {
@@ -141,8 +163,7 @@ impl<E> LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_, '_, E> {
     }
 
     fn jacobian(&self) -> Option<DMatrix<f64>> {
-        let known = self.newest.borrow().as_ref().filter(|(x, ..)| *x == self.x).map(|(.., jacobian)| jacobian.clone());
-        let mut jacobian = known.or_else(|| self.derivatives())?;
+        let mut jacobian = self.known().or_else(|| self.derivatives())?;
         // A number without a derivative stays where it is.
         jacobian.apply(|value| *value = if value.is_nan() { 0.0 } else { *value / self.norm });
         for (mut row, weight) in jacobian.row_iter_mut().zip(self.samples.weights) {
@@ -193,6 +214,7 @@ pub(crate) fn minimize<E>(
         steps,
         x: DVector::zeros(steps.len()),
         predicted: None,
+        beside_first: None,
         predict: RefCell::new(predict),
         newest: RefCell::default(),
         is_near: Cell::new(false),
@@ -217,8 +239,7 @@ pub(crate) fn minimize<E>(
     if let Some(failure) = problem.failure.take() {
         return Err(failure);
     }
-    let newest = problem.newest.take().filter(|(x, ..)| (x - &problem.x).amax() < SAME);
-    let jacobian = newest.map(|(.., jacobian)| jacobian).or_else(|| problem.derivatives());
+    let jacobian = problem.known().or_else(|| problem.derivatives());
     if let Some(failure) = problem.failure.take() {
         return Err(failure);
     }
