@@ -159,7 +159,7 @@ mod tests {
             let grid = Refinement::new(&model.scene, 0, &Limits::default()).unwrap();
             let burns = vertex_burns(&model, &tissue.burns(), Some(&skin), grid, 0);
             let most = burns.iter().map(|of| of.burn).fold(0.0, f32::max);
-            assert!(burns.len() > 3 && most > 0.3 && most <= 0.4, "{is_bound}: {} up to {most}", burns.len());
+            assert!(burns.len() > 3 && most > 0.3 && most < 0.4 + 1e-6, "{is_bound}: {} up to {most}", burns.len());
             for VertexBurn { vertex, burn } in burns {
                 let far_m = skin.rest_m(skin.vertices()[vertex as usize]).distance(place_m);
                 assert!(
