@@ -180,12 +180,12 @@ export async function colourAt(page, x, y) {
 }
 
 /**
- * Of a screenshot's pixels the whitest and the blackest, 0 to 1, and the largest ratio of blue to red of those that are not dark.
+ * Red, green, blue and alpha of each pixel of a screenshot.
  * @param {Page} page @param {Buffer} png
- * @returns {Promise<{ whitest: number, blackest: number, bluest: number }>}
+ * @returns {Promise<number[][]>}
  */
-export function extremes(page, png) {
-  return page.page.evaluate(async (data) => {
+async function pixelsOf(page, png) {
+  const bytes = await page.page.evaluate(async (data) => {
     const image = new Image();
     image.src = `data:image/png;base64,${data}`;
     await image.decode();
@@ -193,16 +193,29 @@ export function extremes(page, png) {
     [canvas.width, canvas.height] = [image.width, image.height];
     const pen = canvas.getContext("2d");
     pen?.drawImage(image, 0, 0);
-    const pixels = pen?.getImageData(0, 0, image.width, image.height).data ?? [];
-    let [whitest, blackest, bluest] = [0, 1, 0];
-    for (let i = 0; i < pixels.length; i += 4) {
-      const [red = 0, green = 0, blue = 0] = [pixels[i], pixels[i + 1], pixels[i + 2]];
-      whitest = Math.max(whitest, Math.min(red, green, blue) / 255);
-      blackest = Math.min(blackest, Math.max(red, green, blue) / 255);
-      bluest = Math.max(bluest, (blue - red) / 255);
-    }
-    return { whitest, blackest, bluest };
+    return [...(pen?.getImageData(0, 0, image.width, image.height).data ?? [])];
   }, png.toString("base64"));
+  return Array.from({ length: bytes.length / 4 }, (_, i) => bytes.slice(4 * i, 4 * i + 4));
+}
+
+/**
+ * Of a screenshot's pixels the whitest and the blackest, 0 to 1, and the largest ratio of blue to red of those that are not dark.
+ * @param {Page} page @param {Buffer} png
+ */
+export async function extremes(page, png) {
+  let [whitest, blackest, bluest] = [0, 1, 0];
+  for (const [red = 0, green = 0, blue = 0] of await pixelsOf(page, png)) {
+    whitest = Math.max(whitest, Math.min(red, green, blue) / 255);
+    blackest = Math.min(blackest, Math.max(red, green, blue) / 255);
+    bluest = Math.max(bluest, (blue - red) / 255);
+  }
+  return { whitest, blackest, bluest };
+}
+
+/** Light (red, green and blue, added) of each pixel of a screenshot, ascending. @param {Page} page @param {Buffer} png */
+export async function lights(page, png) {
+  const pixels = await pixelsOf(page, png);
+  return pixels.map(([red = 0, green = 0, blue = 0]) => red + green + blue).sort((a, b) => a - b);
 }
 
 /** How much more blue than red a screenshot's bluest pixel is. @param {Page} page @param {Buffer} png */
