@@ -171,19 +171,19 @@ fn a_score_has_what_the_tools_did_and_sessions_compare() {
         "{crossing}"
     );
     // The journal is simulated, and gives the same figures on paper and in the file.
-    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.5.mcap");
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.6.mcap");
     let scored = |more: &[&str]| palpate(folder.path(), &[&["journal", "score", golden], more].concat());
     let (status, table) = scored(&["--output", "golden.json", "--report", "golden.html", "--force-limit-n", "1e-4"]);
     assert_eq!((status, table.as_str()), (0, ""));
     let (status, json) = scored(&["--json", "--force-limit-n", "1e-4"]);
     assert_eq!((status, json), (0, read("golden.json")));
     let report = read("golden.html");
-    for part in ["<svg", "data:image/png;base64,", "force_integral_n_s", "palpate journal render golden.5.mcap --at"] {
+    for part in ["<svg", "data:image/png;base64,", "force_integral_n_s", "palpate journal render golden.6.mcap --at"] {
         assert!(report.contains(part), "{part} is not in {report}");
     }
     let compared =
         palpate(folder.path(), &["journal", "compare", "golden.json", "run.json", golden, "--csv", "all.csv"]);
-    says(compared, 0, &["has other thresholds", "sparc[0]", "50 %", "golden.5.mcap"]);
+    says(compared, 0, &["has other thresholds", "sparc[0]", "50 %", "golden.6.mcap"]);
     let csv = read("all.csv");
     let columns: Vec<usize> = csv.lines().map(|line| line.split(',').count()).collect();
     assert!(columns.len() == 4 && columns.iter().all(|count| *count == columns[0]), "{csv}");

@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from server import PROGRAM, ROOT
 
-GOLDEN = ROOT / "tests/journal/golden.5.mcap"
+GOLDEN = ROOT / "tests/journal/golden.6.mcap"
 MESSAGES = {
     "/header": "Header",
     "/inputs": "Inputs",

@@ -10,7 +10,7 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[3] / "tests/python"
 from server import PROGRAM, ROOT, Server  # noqa: E402
 
 EXAMPLES = ROOT / "clients/python/examples"
-GOLDEN = ROOT / "tests/journal/golden.5.mcap"
+GOLDEN = ROOT / "tests/journal/golden.6.mcap"
 
 
 class Served:

@@ -10,7 +10,7 @@ const NO_VALUE: f64 = 1e6;
 
 /// The part of a standard error below which a step no longer matters: of N samples, it changes the sum of squares by its square
 /// divided by N.
-const NEAR: f64 = 0.03;
+const NEAR: f64 = 0.1;
 
 /// The relative change of the numbers below which the search ends.
 const XTOL: f64 = 1e-4;

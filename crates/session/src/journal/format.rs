@@ -9,7 +9,7 @@ use super::records::{self, CHANNEL, SCHEMA};
 
 /// Generation of the arithmetic. It is raised with each change after which equal inputs give other bits. A journal
 /// with another number can be shown and exported, but neither verified nor continued.
-pub const REPLAYS: u32 = 5;
+pub const REPLAYS: u32 = 6;
 
 /// Version of this program, which it writes into journals.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -64,7 +64,7 @@ const SWEEPS: usize = 8;
 /// The sweeps end when none has changed a force by more than this part of the largest one.
 const SETTLED: f64 = 1e-5;
 
-/// Samples are at most this part of the radius apart, and at most a cell.
+/// Samples are at most this part of the radius apart, and at most a cell; where triangles are finer than half of that, they are joined.
 const SPACING: f64 = 0.35;
 
 /// Samples are taken as far around the tool as this, times the radius: half of the surface of a sphere that is deep within the

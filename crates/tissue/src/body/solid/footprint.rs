@@ -4,6 +4,8 @@
 //! (`body::footprint`): a solid carries a load sideways, and a smaller disc would be too soft. (Disc of 5 mm on cubes of
 //! 2.5 to 5 mm: 13 to 32 % too soft with the smaller one.)
 
+use std::cmp::Ordering;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
@@ -14,6 +16,7 @@ use crate::body::surface::footprint::MeshDisc;
 use crate::saved::SavedPlace;
 use crate::scene::SolidShape;
 use crate::shape::{CellPlace, PointId};
+use palpate_geometry::fill::Lattice;
 use palpate_refusal::Result;
 
 /// A side of a triangle is divided into at most so many parts.
@@ -22,6 +25,80 @@ const MAX_SIDE_PARTS: f64 = 16.0;
 /// Returns the places of the corners of a cell, if a cut has doubled any of them.
 fn copies_in(shape: &SolidShape, copies: Option<&CornerCopies>, cell: &CellPlace) -> Option<[u32; 8]> {
     copies?.cut_corners(shape.corner_of(PointId::new(cell.points[0] as usize)))
+}
+
+/// A part of the surface at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct RestPart {
+    /// Its middle, m.
+    rest_m: DVec3,
+    /// Its outward normal times its area, m².
+    outward_m2: DVec3,
+    area_m2: f64,
+}
+
+/// Divides each triangle (its corners, m) into equal ones of the same shape, whose sides are at most `spacing_m` (m).
+fn divided(triangles: &[[DVec3; 3]], spacing_m: f64) -> Vec<RestPart> {
+    let mut divided = Vec::with_capacity(triangles.len());
+    for [a, b, c] in triangles.iter().copied() {
+        let longest_m = (b - a).length().max((c - b).length()).max((a - c).length());
+        let parts = (longest_m / spacing_m).ceil().clamp(1.0, MAX_SIDE_PARTS);
+        let outward_m2 = 0.5 * (b - a).cross(c - a) / (parts * parts);
+        let (along, across) = ((b - a) / parts, (c - a) / parts);
+        let mut add = |by_along: f64, by_across: f64| {
+            let rest_m = a + by_along * along + by_across * across;
+            let area_m2 = outward_m2.length();
+            if area_m2 > 0.0 {
+                divided.push(RestPart { rest_m, outward_m2, area_m2 });
+            }
+        };
+        let parts = parts as u32;
+        for i in 0..parts {
+            for j in 0..parts - i {
+                let (i, j) = (f64::from(i), f64::from(j));
+                add(i + 1.0 / 3.0, j + 1.0 / 3.0);
+                if i + j < f64::from(parts) - 1.5 {
+                    add(i + 2.0 / 3.0, j + 2.0 / 3.0);
+                }
+            }
+        }
+    }
+    divided
+}
+
+/// Joins parts in the same box of the lattice that face the same way: the triangles of a surface may be much finer than the cells, and a
+/// contact with each of them would take many times as long and tell no more. Each cell is divided into equal boxes with sides of at most
+/// half of `spacing_m` (m). The joined parts come in the order of their first ones, and each is the same, to the bit, in whatever order
+/// its parts come.
+fn joined(parts: Vec<RestPart>, lattice: &Lattice, spacing_m: f64) -> Vec<RestPart> {
+    let boxes = (2.0 * lattice.edge_m / spacing_m).ceil();
+    let mut numbers: BTreeMap<_, usize> = BTreeMap::new();
+    let mut groups: Vec<Vec<RestPart>> = Vec::new();
+    for part in parts {
+        let in_box = (boxes * lattice.from_m(part.rest_m)).to_array().map(|along| along.floor() as i64);
+        // The axis that the part faces most, and to which side.
+        let axis = part.outward_m2.abs().max_position();
+        let number = *numbers.entry((in_box, axis, part.outward_m2[axis] > 0.0)).or_insert(groups.len());
+        if number == groups.len() {
+            groups.push(Vec::new());
+        }
+        groups[number].push(part);
+    }
+    let join = |mut group: Vec<RestPart>| {
+        group.sort_by(|a, b| {
+            let of = |part: &RestPart| part.rest_m.to_array();
+            of(a).iter().zip(of(b)).map(|(a, b)| a.total_cmp(&b)).find(|order| order.is_ne()).unwrap_or(Ordering::Equal)
+        });
+        // A part of its own keeps its bits.
+        if let [only] = group[..] {
+            return only;
+        }
+        let area_m2: f64 = group.iter().map(|part| part.area_m2).sum();
+        let outward_m2 = group.iter().map(|part| part.outward_m2).sum();
+        let rest_m = group.iter().map(|part| part.area_m2 * part.rest_m).sum::<DVec3>() / area_m2;
+        RestPart { rest_m, outward_m2, area_m2 }
+    };
+    groups.into_iter().map(join).collect()
 }
 
 /// The part of a vertex's weight and derivative that a point gets.
@@ -110,39 +187,14 @@ impl TissueDisc for SolidDisc {
         self.disc.leap(place_m, &of_vertex)
     }
 
-    /// Divides each triangle into equal ones of the same shape, and takes their middles.
     fn samples(&self, reach_m: f64, spacing_m: f64, copies: Option<&CornerCopies>) -> Vec<SurfaceSample> {
-        let mut samples = Vec::new();
-        for [a, b, c] in self.disc.triangles_around(reach_m) {
-            let longest_m = (b - a).length().max((c - b).length()).max((a - c).length());
-            let parts = (longest_m / spacing_m).ceil().clamp(1.0, MAX_SIDE_PARTS);
-            let cross = (b - a).cross(c - a);
-            let area_m2 = 0.5 * cross.length() / (parts * parts);
-            let (along, across) = ((b - a) / parts, (c - a) / parts);
-            let mut add = |by_along: f64, by_across: f64| {
-                let rest_m = a + by_along * along + by_across * across;
-                let outward = cross.normalize_or_zero();
-                let cell = self.shape.bind(rest_m);
-                samples.push(SurfaceSample {
-                    rest_m,
-                    outward,
-                    area_m2,
-                    copies: copies_in(&self.shape, copies, &cell),
-                    cell,
-                });
-            };
-            let parts = parts as u32;
-            for i in 0..parts {
-                for j in 0..parts - i {
-                    let (i, j) = (f64::from(i), f64::from(j));
-                    add(i + 1.0 / 3.0, j + 1.0 / 3.0);
-                    if i + j < f64::from(parts) - 1.5 {
-                        add(i + 2.0 / 3.0, j + 2.0 / 3.0);
-                    }
-                }
-            }
-        }
-        samples
+        let parts = divided(&self.disc.triangles_around(reach_m), spacing_m);
+        let sample = |RestPart { rest_m, outward_m2, area_m2 }: RestPart| {
+            let cell = self.shape.bind(rest_m);
+            let copies = copies_in(&self.shape, copies, &cell);
+            SurfaceSample { rest_m, outward: outward_m2.normalize_or_zero(), area_m2, copies, cell }
+        };
+        joined(parts, self.shape.lattice(), spacing_m).into_iter().map(sample).collect()
     }
 
     fn cover(&mut self, copies: Option<&CornerCopies>, add: &mut dyn FnMut(DiscPoint, f64, DVec2)) {
@@ -178,4 +230,61 @@ impl TissueDisc for SolidDisc {
 /// Returns the corner of a point.
 fn corner_of(shape: &SolidShape, point: u32) -> u32 {
     u32::try_from(shape.corner_of(PointId::new(point as usize))).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CELLS: Lattice = Lattice { origin_m: DVec3::ZERO, edge_m: 0.005, cells: [4, 4, 2] };
+
+    /// The triangles of a square of 20 mm at a height, of so many squares along a side.
+    fn square(height_m: f64, squares: u32) -> Vec<[DVec3; 3]> {
+        let side_m = 0.02 / f64::from(squares);
+        let at = |i: u32, j: u32| DVec3::new(side_m * f64::from(i), side_m * f64::from(j), height_m);
+        (0..squares * squares)
+            .map(|square| (square / squares, square % squares))
+            .flat_map(|(i, j)| [[at(i, j), at(i + 1, j), at(i + 1, j + 1)], [at(i, j), at(i + 1, j + 1), at(i, j + 1)]])
+            .collect()
+    }
+
+    fn area_m2(parts: &[RestPart]) -> f64 {
+        parts.iter().map(|part| part.area_m2).sum()
+    }
+
+    #[test]
+    fn triangles_much_finer_than_cells_are_four_parts_on_each_cell_with_the_same_area_and_coarse_ones_are_divided() {
+        let joined_of = |squares, spacing_m| joined(divided(&square(0.0099, squares), spacing_m), &CELLS, spacing_m);
+        let fine = joined_of(64, 0.005);
+        assert_eq!(fine.len(), 4 * 16);
+        assert!((area_m2(&fine) - 4e-4).abs() < 1e-15, "{}", area_m2(&fine));
+        for part in &fine {
+            assert!((part.outward_m2 - DVec3::new(0.0, 0.0, 6.25e-6)).length() < 1e-12, "{part:?}");
+            let in_box = (part.rest_m / 0.0025).fract();
+            assert!((in_box.truncate() - 0.5).abs().max_element() < 1e-9, "{part:?}");
+        }
+        let coarse = joined_of(1, 0.005);
+        assert_eq!(coarse.len(), divided(&square(0.0099, 1), 0.005).len());
+        assert!((area_m2(&coarse) - 4e-4).abs() < 1e-15, "{}", area_m2(&coarse));
+    }
+
+    /// Forces stay with parts when a tip takes samples anew, from another place outward.
+    #[test]
+    fn joined_parts_have_the_same_bits_in_any_order_and_sides_that_face_apart_stay_apart() {
+        let mut triangles = square(0.0099, 32);
+        triangles.extend(square(0.0098, 32).into_iter().map(|[a, b, c]| [a, c, b]));
+        let parts = divided(&triangles, 0.005);
+        let sorted = |mut parts: Vec<RestPart>| {
+            parts.sort_by(|a, b| {
+                let of = |part: &RestPart| [part.rest_m.x, part.rest_m.y, part.outward_m2.z].map(f64::to_bits);
+                of(a).cmp(&of(b))
+            });
+            parts
+        };
+        let forward = sorted(joined(parts.clone(), &CELLS, 0.005));
+        let backward = sorted(joined(parts.into_iter().rev().collect(), &CELLS, 0.005));
+        assert_eq!(forward, backward);
+        assert_eq!(forward.len(), 2 * 4 * 16);
+        assert!((forward.iter().map(|part| part.outward_m2).sum::<DVec3>()).length() < 1e-15);
+    }
 }
