@@ -4414,7 +4414,7 @@ impl ::prost::Name for Springs {
         "/palpate.v1.Springs".into()
     }
 }
-/// How a tissue is cut: how it resists a blade, when it tears, and where its anchor springs end.
+/// How a tissue is cut: how it resists a blade, when it tears, where its anchor springs end, and how stiff burns make it.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Cutting {
     /// Fracture toughness: the work of a cut for each unit of its area, J/m²; 0 or more. 0: a blade feels nothing.
@@ -4438,6 +4438,10 @@ pub struct Cutting {
     /// normal of each point. With `anchor_depth_m` only.
     #[prost(message, optional, tag = "6")]
     pub anchor_direction: ::core::option::Option<Vector3>,
+    /// On a sheet or a mesh without a pretension: the factor by which springs are stiffer where a tip has burnt the tissue through; 1 to 100. It
+    /// rises with the burn. Absent: burns change no stiffness.
+    #[prost(double, optional, tag = "7")]
+    pub burnt_stiffness_factor: ::core::option::Option<f64>,
 }
 impl ::prost::Name for Cutting {
     const NAME: &'static str = "Cutting";

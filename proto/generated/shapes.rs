@@ -695,6 +695,7 @@ Field { number: 3, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 4, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 5, is_list: false, kind: FieldKind::Number(8, 8) },
 Field { number: 6, is_list: false, kind: FieldKind::Message(0) },
+Field { number: 7, is_list: false, kind: FieldKind::Number(8, 8) },
 ] },
 Shape { name: "palpate.v1.AnchorSprings", bytes: size_of::<crate::pb::AnchorSprings>(), decode: |bytes| <crate::pb::AnchorSprings as Message>::decode(bytes).is_ok(), fields: &[
 Field { number: 1, is_list: false, kind: FieldKind::Number(8, 8) },

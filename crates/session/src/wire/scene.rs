@@ -77,9 +77,18 @@ fn from_cutting(message: pb::Cutting) -> Cutting {
         tear_reference_m,
         anchor_depth_m,
         anchor_direction,
+        burnt_stiffness_factor,
     } = message;
     let anchor_direction = anchor_direction.map(|direction| from_vector(Some(&direction)));
-    Cutting { toughness_j_per_m2, thickness_m, tear_strain, tear_reference_m, anchor_depth_m, anchor_direction }
+    Cutting {
+        toughness_j_per_m2,
+        thickness_m,
+        tear_strain,
+        tear_reference_m,
+        anchor_depth_m,
+        anchor_direction,
+        burnt_stiffness_factor,
+    }
 }
 
 /// Returns a tissue whose coefficients the message gives.
@@ -476,6 +485,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             tear_reference_m: scene.cutting.tear_reference_m,
             anchor_depth_m: scene.cutting.anchor_depth_m,
             anchor_direction: scene.cutting.anchor_direction.and_then(vector),
+            burnt_stiffness_factor: scene.cutting.burnt_stiffness_factor,
         }),
     }
 }
@@ -811,6 +821,7 @@ mod tests {
         material_of(&mut message).foundation_group = Some("lump".to_owned());
         message.cutting = Some(pb::Cutting {
             anchor_depth_m: Some(0.003),
+            burnt_stiffness_factor: Some(4.0),
             anchor_direction: vector(DVec3::new(0.0, -1.0, 2.0)),
             ..Default::default()
         });

@@ -56,6 +56,12 @@ impl Elements {
         });
     }
 
+    /// Multiplies the stiffness of each spring by a factor, which is given its ends.
+    pub(crate) fn stiffen(&mut self, factor: impl Fn([usize; 2]) -> f64) {
+        let Elements::Springs(springs) = self else { return };
+        springs.iter_mut().for_each(|spring| spring.stiffness_n_per_m *= factor(spring.ends));
+    }
+
     /// Computes forces and their derivatives at the present displacements of the points, m. Adds to `blocks` the
     /// stiffness that holds each point if the others are held.
     pub(crate) fn linearise(&mut self, displacement_m: &[DVec3], blocks: &mut [DMat3]) {

@@ -2,6 +2,7 @@
 //! the contact of a disc with it.
 
 mod advance;
+pub(crate) mod burnt_stiffness;
 pub(crate) mod disc;
 pub(crate) mod elements;
 pub(crate) mod footprint;

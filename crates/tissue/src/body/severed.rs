@@ -12,6 +12,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
+use crate::body::burnt_stiffness::BurntStiffness;
 use crate::body::model::Model;
 use crate::body::solid::corner_copies::{CornerCopies, DoubledCorner};
 use crate::saved::{SavedSpring, ensure, unsound};
@@ -41,7 +42,7 @@ pub(crate) struct SeveredSpring {
     pub(crate) version: u32,
 }
 
-/// The severed springs of a tissue, in the order in which they were severed. Clones share the list.
+/// The severed springs of a tissue, in the order in which they were severed, and how stiff burns have made the others. Clones share the lists.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Cuts {
     springs: Arc<Vec<SeveredSpring>>,
@@ -54,6 +55,8 @@ pub struct Cuts {
     fracture_j: f64,
     /// The corners of a solid that these cuts double; `None` without any, and for other tissues.
     copies: Option<Arc<CornerCopies>>,
+    /// The points that burns have made stiffer: a function of the tissue's burns. They are no part of the topology and its versions.
+    burnt: BurntStiffness,
 }
 
 /// A spring that is severed, by its points ([`Cuts::joints`]).
@@ -131,10 +134,26 @@ impl Cuts {
         })
     }
 
-    /// Returns whether a severed spring rests within a distance of a place, m: its first end, in a solid the lower of the two cubes.
+    /// Returns whether a severed spring rests within a distance of a place, m, its first end, in a solid the lower of the two cubes; or a
+    /// point that a burn has made stiffer.
     pub(crate) fn are_near(&self, model: &Model, place_m: DVec3, within_m: f64) -> bool {
-        let rest_m = |spring: &SeveredSpring| model.end_at_rest_m(spring.ends[0] as usize);
-        self.springs.iter().any(|spring| rest_m(spring).distance(place_m) <= within_m)
+        let first_ends = self.springs.iter().map(|spring| spring.ends[0] as usize);
+        first_ends.chain(self.burnt.places()).any(|place| model.end_at_rest_m(place).distance(place_m) <= within_m)
+    }
+
+    /// Returns the points that burns have made stiffer.
+    pub(crate) fn burnt(&self) -> &BurntStiffness {
+        &self.burnt
+    }
+
+    /// Returns whether all springs are as the model has them.
+    pub(crate) fn are_none(&self) -> bool {
+        self.is_empty() && self.burnt.is_empty()
+    }
+
+    /// Returns these cuts in a tissue with such burns.
+    pub(crate) fn burnt_by(self, burnt: BurntStiffness) -> Self {
+        Cuts { burnt, ..self }
     }
 
     /// Returns the number of parts into which the severed springs divide the tissue: 1 for one that is whole. Points that the model
@@ -258,7 +277,9 @@ impl Model {
         const LISTS: u64 = 5;
         let anchors = if self.scene.cutting.anchor_depth_m.is_some() { self.place_count() as u64 } else { 0 };
         let (springs, ends) = (self.end_count() as u64 / 2 + anchors, self.end_count() as u64 + anchors);
-        LISTS * springs * size_of::<SeveredSpring>() as u64 + ends / 8
+        let burnt =
+            if self.scene.cutting.burnt_stiffness() > 1.0 { BurntStiffness::bytes(self.place_count()) } else { 0 };
+        LISTS * (springs * size_of::<SeveredSpring>() as u64 + burnt) + ends / 8
     }
 }
 
@@ -297,6 +318,17 @@ impl Severed {
     #[inline(always)]
     pub(crate) fn has(&self, end: usize) -> bool {
         self.ends.get(end / 64).is_some_and(|bits| bits >> (end % 64) & 1 != 0)
+    }
+
+    /// Returns the factor of the stiffness of a spring between two places, by the number of its end among those of all places; 0: it is severed.
+    #[inline(always)]
+    pub(crate) fn factor(&self, end: usize, places: [usize; 2]) -> f64 {
+        if self.has(end) { 0.0 } else { self.cuts.burnt.of_spring(places) }
+    }
+
+    /// Sets the points that burns have made stiffer.
+    pub(crate) fn set_burnt(&mut self, burnt: BurntStiffness) {
+        self.cuts.burnt = burnt;
     }
 
     /// Returns whether the anchor spring of the point at a place in memory is severed.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use crate::body::Places;
 use crate::body::advance::AdvanceStage;
+use crate::body::burnt_stiffness::BurntStiffness;
 use crate::body::footprint::mass_at;
 use crate::body::force_field::{self, Pull, Term};
 use crate::body::model::{Model, Plan};
@@ -15,7 +16,7 @@ use crate::body::sheet::grid::Grid;
 use crate::body::sheet::sweep::Sweep;
 use crate::body::solid::corner_copies::DoubledCorner;
 use crate::body::solid::{self, NeoHookean, PointLoad, SolidGrid, SolidPlaces, SolidSweep, SolidTables};
-use crate::body::spring_ends::SHEET_ENDS;
+use crate::body::spring_ends::{SHEET_ENDS, SpringEnd};
 use crate::body::surface::pressure::{Pressure, push_of};
 use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use crate::kernel::field::{BLOCK, Field, Layout, State};
@@ -69,7 +70,9 @@ impl<T: Real> Elastic<T> {
             Elastic::Sheet(springs, pull) => {
                 let place = point[0] * layout.columns + point[1];
                 let first = SHEET_ENDS * place;
-                let mut force = springs.gather(layout, u, point, |number| severed.has(first + number));
+                let mut force = springs.gather(layout, u, point, |number, [i, j]| {
+                    severed.factor(first + number, [place, i * layout.columns + j])
+                });
                 if severed.anchor_count() > 0 {
                     let pull = Scalar(*pull * T::of(severed.extra_anchor(0.0, place)));
                     for c in 0..3 {
@@ -90,7 +93,8 @@ impl<T: Real> Elastic<T> {
                 let first = places.slots.first_half(slot);
                 let of_model = places.slots.extra_of(slot).or((severed.anchor_count() > 0).then_some(0.0));
                 let pull = (*pull, of_model.map(|of_model| severed.extra_anchor(of_model, slot)));
-                surface::gather(&places.slots, unit, pull, pressed, u, slot, |number| severed.has(first + number))
+                let factor = |number: usize, other: usize| severed.factor(first + number, [slot, other]);
+                surface::gather(&places.slots, unit, pull, pressed, u, slot, factor)
             }
         }
     }
@@ -135,6 +139,16 @@ pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
             places.volume.as_ref().map_or(0.0, |volume| unit * model.scene.volume_stiffness_pa * volume.stretch_m),
         ),
     }
+}
+
+/// A spring whose stiffness a burn has changed, seen from one of its ends.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct StiffenedSpring {
+    /// The place of this end.
+    pub(crate) place: usize,
+    pub(crate) spring: SpringEnd,
+    /// The factor of its stiffness before, and now.
+    pub(crate) factors: [f64; 2],
 }
 
 /// The springs of a mesh as its sweeps read them, and memory for a snapshot of the displacements.
@@ -228,7 +242,8 @@ impl<T: Real> SweepTables<T> {
     /// Severs a spring. Returns the corners that this doubles, if the spring was whole.
     pub(crate) fn sever(&mut self, model: &Model, spring: SeveredSpring) -> Option<Vec<DoubledCorner>> {
         let doubled = self.severed.add(model, spring)?;
-        self.set_spring(model, &spring, true);
+        let was = self.severed.burnt().of_spring(spring.ends.map(|place| place as usize));
+        self.set_spring(model, &spring, [was, 0.0]);
         if let (Some(solid), Some(places), Some(copies)) =
             (&mut self.solid, model.places.solid(), self.severed.copies())
         {
@@ -255,11 +270,15 @@ impl<T: Real> SweepTables<T> {
         }
     }
 
-    /// Makes the severed springs those of `cuts` ([`Severed::replace`]).
+    /// Makes the severed and the burnt springs those of `cuts` ([`Severed::replace`]).
     pub(crate) fn set_severed(&mut self, model: &Model, cuts: &Cuts) {
+        let was = self.severed.burnt().clone();
         let [whole, severed] = self.severed.replace(model, cuts);
-        whole.iter().for_each(|spring| self.set_spring(model, spring, false));
-        severed.iter().for_each(|spring| self.set_spring(model, spring, true));
+        let burnt = |spring: &SeveredSpring| was.of_spring(spring.ends.map(|place| place as usize));
+        whole.iter().for_each(|spring| self.set_spring(model, spring, [0.0, burnt(spring)]));
+        severed.iter().for_each(|spring| self.set_spring(model, spring, [burnt(spring), 0.0]));
+        self.severed.set_burnt(was);
+        self.set_burnt(model, cuts.burnt().clone());
         if cuts.anchor_count() == 0 {
             self.cuts.forget_anchors();
             if let (Places::Surface(places), Some(mesh)) = (&model.places, &mut self.mesh) {
@@ -271,6 +290,31 @@ impl<T: Real> SweepTables<T> {
             solid.follow(places, &self.layout, copies.as_deref());
         }
         copies.iter().flat_map(|copies| copies.places()).for_each(|place| self.hold_copy(place));
+    }
+
+    /// Makes the whole springs as stiff as burns have made them. Returns those that this changes.
+    pub(crate) fn set_burnt(&mut self, model: &Model, burnt: BurntStiffness) -> Vec<StiffenedSpring> {
+        let was = self.severed.burnt().clone();
+        let mut places: Vec<usize> = was.differences(&burnt).collect();
+        places.sort_unstable();
+        places.dedup();
+        let mut changed = Vec::new();
+        for place in places.iter().copied() {
+            let first_end = model.first_end(place);
+            model.each_spring(place, |spring| {
+                let ends = [place, spring.other];
+                let is_known = spring.other < place && places.binary_search(&spring.other).is_ok();
+                let factors = [&was, &burnt].map(|burnt| burnt.of_spring(ends));
+                if !is_known && factors[0] != factors[1] && !self.severed.has(first_end + spring.number) {
+                    changed.push(StiffenedSpring { place, spring, factors });
+                }
+            });
+        }
+        for StiffenedSpring { place, spring, factors } in &changed {
+            self.set_factor(model, [*place, spring.other], spring.number, *factors);
+        }
+        self.severed.set_burnt(burnt);
+        changed
     }
 
     /// Returns the relative mass at a place in memory, after cuts.
@@ -307,31 +351,40 @@ impl<T: Real> SweepTables<T> {
         mass * (force_n + pulled_n)
     }
 
-    /// Writes to the tables whether a spring is severed, as the set of severed springs has it.
-    fn set_spring(&mut self, model: &Model, spring: &SeveredSpring, is_severed: bool) {
+    /// Writes to the tables that a spring has been severed or is whole again: the factor of its stiffness before and now.
+    fn set_spring(&mut self, model: &Model, spring: &SeveredSpring, factors: [f64; 2]) {
         let [first, second] = spring.ends.map(|place| place as usize);
-        let number = spring.number as usize;
+        if !spring.is_anchor() {
+            self.set_factor(model, [first, second], spring.number as usize, factors);
+        }
         match (&model.places, &mut self.mesh) {
             (Places::Sheet(_), _) if spring.is_anchor() => {
-                self.cuts.set_anchor(&self.layout, model.point_of(first), is_severed);
-            }
-            (Places::Sheet(_), _) => {
-                let by = ENDS[number / 4][number % 4];
-                self.cuts.set(&self.layout, model.point_of(first), by, is_severed);
+                self.cuts.set_anchor(&self.layout, model.point_of(first), factors[1] == 0.0);
             }
             (Places::Surface(places), Some(mesh)) if spring.is_anchor() => {
-                mesh.springs.set_anchor(&places.slots, first, is_severed);
+                mesh.springs.set_anchor(&places.slots, first, factors[1] == 0.0);
+            }
+            (Places::Surface(places), Some(mesh)) if model.prestrain > 0.0 => {
+                for slot in [first, second] {
+                    let end = model.first_end(slot);
+                    mesh.springs.set_load(&places.slots, slot, |number| self.severed.has(end + number));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Writes the factor of the stiffness of a spring to the tables; it is given by its ends and its number at the first one.
+    fn set_factor(&mut self, model: &Model, [first, second]: [usize; 2], number: usize, factors: [f64; 2]) {
+        match (&model.places, &mut self.mesh) {
+            (Places::Sheet(_), _) => {
+                let by = ENDS[number / 4][number % 4];
+                self.cuts.set(&self.layout, model.point_of(first), by, factors[1]);
             }
             (Places::Surface(places), Some(mesh)) => {
-                mesh.springs.set(&places.slots, first, number, is_severed);
+                mesh.springs.set(&places.slots, first, number, factors);
                 let back = model.number_at_other_end(first, number);
-                mesh.springs.set(&places.slots, second, back, is_severed);
-                if model.prestrain > 0.0 {
-                    for slot in [first, second] {
-                        let end = model.first_end(slot);
-                        mesh.springs.set_load(&places.slots, slot, |number| self.severed.has(end + number));
-                    }
-                }
+                mesh.springs.set(&places.slots, second, back, factors);
             }
             _ => {}
         }

@@ -200,7 +200,8 @@ impl<T: Real> Springs<T> {
         self.structural.tension != T::default() || self.shear.tension != T::default()
     }
 
-    /// Returns the force of all springs on the point [i, j], but for those that `is_severed`, by their number. For a few single points.
+    /// Returns the force of all springs on the point [i, j]. `factor` gives the factor of the stiffness of each from its number and the row and
+    /// column of its other end; 0: it is severed. For a few single points.
     // Loops over indices: iterators are not always inlined, and then run without the caller's instructions.
     #[allow(clippy::needless_range_loop)]
     #[inline(always)]
@@ -209,7 +210,7 @@ impl<T: Real> Springs<T> {
         layout: &Layout,
         u: &[T],
         [i, j]: [usize; 2],
-        is_severed: impl Fn(usize) -> bool,
+        factor: impl Fn(usize, [usize; 2]) -> f64,
     ) -> [T; 3] {
         let mut sum = [T::default(); 3];
         let own = i * layout.stride + j;
@@ -226,7 +227,8 @@ impl<T: Real> Springs<T> {
                 #[allow(clippy::cast_precision_loss)]
                 let rest = [T::of(di as f64), T::of(dj as f64), T::default()];
                 let tension = spring.tension;
-                if is_severed(4 * kind + end) {
+                let factor = factor(4 * kind + end, [i1, j1]);
+                if factor == 0.0 {
                     // What held the rest shape against the spring stays.
                     for c in 0..3 {
                         sum[c] += T::default() - tension * rest[c];
@@ -242,7 +244,7 @@ impl<T: Real> Springs<T> {
                 for c in 0..3 {
                     squares = delta[c].fused(delta[c], squares);
                 }
-                let weight = spring.weight(Scalar(squares)).0;
+                let weight = spring.weight(Scalar(squares)).0 * T::of(factor);
                 for c in 0..3 {
                     sum[c] += (weight + tension).fused(delta[c], weight * rest[c]);
                 }

@@ -220,6 +220,7 @@ impl<'m> LinearPatch<'m> {
             allowance: Allowance::default(),
         };
         patch.sever(cuts, turn);
+        patch.stiffen(cuts);
         patch.linearise();
         patch
     }
@@ -269,6 +270,14 @@ impl<'m> LinearPatch<'m> {
         freed.iter().for_each(|at| self.own_n_per_m[*at] = 0.0);
         if model.prestrain != 0.0 {
             self.loads_n = loads_n;
+        }
+    }
+
+    /// Makes springs as stiff as burns have made them.
+    fn stiffen(&mut self, cuts: &Cuts) {
+        if !cuts.burnt().is_empty() {
+            let places: Vec<usize> = self.window.points(self.model).collect();
+            self.elements.stiffen(|ends| cuts.burnt().of_spring(ends.map(|end| places[end])));
         }
     }
 

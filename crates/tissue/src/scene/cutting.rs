@@ -1,4 +1,4 @@
-//! How a tissue is cut: how it resists a blade, when it tears, and where its anchor springs end.
+//! How a tissue is cut: how it resists a blade, when it tears, where its anchor springs end, and how stiff burns make it.
 
 use glam::DVec3;
 
@@ -9,7 +9,10 @@ use palpate_refusal::{Reason, Refusal, Result, finite_vector, not_negative, numb
 /// The largest strain that may be given as the one at which a tissue tears.
 const MAX_TEAR_STRAIN: f64 = 10.0;
 
-/// How a tissue is cut: how it resists a blade, when it tears, and where its anchor springs end.
+/// The largest factor by which burns may make a tissue stiffer: a step then takes ten times as many substeps.
+const MAX_BURNT_STIFFNESS_FACTOR: f64 = 100.0;
+
+/// How a tissue is cut: how it resists a blade, when it tears, where its anchor springs end, and how stiff burns make it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Cutting {
     /// Fracture toughness Gc: the work that a cut takes for each unit of its area, J/m²; 0: a blade feels nothing. Porcine liver by a
@@ -31,6 +34,9 @@ pub struct Cutting {
     /// The direction from the points to where their anchors are attached, of any length above 0. `None`: into the tissue, against
     /// the normal of each point.
     pub anchor_direction: Option<DVec3>,
+    /// The factor by which the springs of a sheet or surface without a pretension are stiffer where the tissue has burnt through; from 1
+    /// to 100. It rises with the burn. `None`: burns change no stiffness.
+    pub burnt_stiffness_factor: Option<f64>,
 }
 
 impl Cutting {
@@ -45,13 +51,16 @@ impl Cutting {
                 tear_reference_m: fields.number("tear_reference_m")?,
                 anchor_depth_m: fields.number("anchor_depth_m")?,
                 anchor_direction: fields.item("anchor_direction").map(|item| item.vector()).transpose()?,
+                burnt_stiffness_factor: fields.number("burnt_stiffness_factor")?,
             })
         })
     }
 
-    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs.
-    pub(super) fn check(&self, has_anchors: bool) -> Result<()> {
+    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs, which are those that burn, and `is_tense` whether
+    /// this one has a pretension.
+    pub(super) fn check(&self, has_anchors: bool, is_tense: bool) -> Result<()> {
         self.check_anchors(has_anchors)?;
+        self.check_burns(has_anchors, is_tense)?;
         not_negative("cutting.toughness_j_per_m2", self.toughness_j_per_m2)?;
         self.thickness_m.map_or(Ok(()), |thickness_m| positive("cutting.thickness_m", thickness_m).map(drop))?;
         if let Some(strain) = self.tear_strain {
@@ -82,6 +91,23 @@ impl Cutting {
         physical("cutting.anchor_direction", finite_vector("cutting.anchor_direction", direction)?.length()).map(drop)
     }
 
+    fn check_burns(&self, burns: bool, is_tense: bool) -> Result<()> {
+        let (field, Some(factor)) = ("cutting.burnt_stiffness_factor", self.burnt_stiffness_factor) else {
+            return Ok(());
+        };
+        let range = format!("from 1 to {MAX_BURNT_STIFFNESS_FACTOR}");
+        number(field, factor, &range, |v| (1.0..=MAX_BURNT_STIFFNESS_FACTOR).contains(&v))?;
+        let message = if !burns {
+            "is for [sheet] and [mesh]: no tip burns a solid"
+        } else if is_tense && factor > 1.0 {
+            // Burnt collagen shrinks, so its tension rises by more than its strain at rest says.
+            "does not go with springs.pretension_n_per_m: the tension of burnt tissue is not known; leave one of both out"
+        } else {
+            return Ok(());
+        };
+        Err(Refusal::new(Reason::WrongKind, field, message))
+    }
+
     /// Returns the values with every −0 replaced by 0. Values that must be above 0 need no replacement.
     #[must_use]
     pub(super) fn with_unsigned_zeros(self) -> Self {
@@ -91,6 +117,11 @@ impl Cutting {
             anchor_direction: self.anchor_direction.map(|direction| direction + DVec3::ZERO),
             ..self
         }
+    }
+
+    /// Returns the factor of the stiffness of springs where the tissue has burnt through; 1: burns change nothing.
+    pub(crate) fn burnt_stiffness(&self) -> f64 {
+        self.burnt_stiffness_factor.unwrap_or(1.0)
     }
 
     /// Returns the vector from a point to where its anchor is attached, m; `normal` is that of the surface at the point.

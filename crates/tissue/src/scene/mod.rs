@@ -584,7 +584,7 @@ impl Scene {
             return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
         }
         self.check_pretension()?;
-        self.cutting.check(!matches!(self.body, Body::Solid(_)))?;
+        self.cutting.check(!matches!(self.body, Body::Solid(_)), self.springs.pretension_n_per_m > 0.0)?;
         self.check_integrator()?;
         self.stepping.check(limits)?;
         if let Some(tolerance) = self.sleep_tolerance {

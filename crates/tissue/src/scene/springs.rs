@@ -27,4 +27,12 @@ impl Springs {
             pretension_n_per_m: 0.0,
         }
     }
+
+    /// Returns springs that are `by` times as stiff.
+    #[must_use]
+    pub fn stiffened(&self, by: f64) -> Self {
+        let (stiffness_n_per_m, shear_stiffness_n_per_m) =
+            (by * self.stiffness_n_per_m, by * self.shear_stiffness_n_per_m);
+        Springs { stiffness_n_per_m, shear_stiffness_n_per_m, ..*self }
+    }
 }

@@ -1,6 +1,6 @@
 //! Computes how fast a tissue can vibrate, and how many substeps that requires.
 
-use crate::scene::{Integrator, Scene};
+use crate::scene::{Integrator, Scene, Springs};
 use crate::scheme::{Bound, Oscillator, Scheme, entry};
 
 /// Largest turn of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is
@@ -30,16 +30,22 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
 /// k·β + K″·ε, with β the bound of the graph's Laplacian divided by k
 /// ([`StiffnessBound`](crate::scene::StiffnessBound)) and ε the largest excess of K″/m of a point over the
 /// reference value. A volume replaces k·β by
-/// [`Swelling::bound_n_per_m`](crate::scene::Swelling::bound_n_per_m).
+/// [`Swelling::bound_n_per_m`](crate::scene::Swelling::bound_n_per_m). If burns make the tissue stiffer, k is that of a tissue that has
+/// burnt through everywhere ([`Cutting::burnt_stiffness_factor`](crate::scene::Cutting::burnt_stiffness_factor)).
 pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
-    let (springs, anchor_n_per_m) = (&scene.springs, scene.anchor_stiffness_n_per_m);
-    scene.body.kind().stiffness_bound_n_per_m(springs, anchor_n_per_m, scene.volume_stiffness_pa)
+    let (springs, anchor_n_per_m) = (stiffest_springs(scene), scene.anchor_stiffness_n_per_m);
+    scene.body.kind().stiffness_bound_n_per_m(&springs, anchor_n_per_m, scene.volume_stiffness_pa)
+}
+
+/// Returns the springs of a tissue that has burnt through everywhere.
+fn stiffest_springs(scene: &Scene) -> Springs {
+    scene.springs.stiffened(scene.cutting.burnt_stiffness())
 }
 
 /// Returns an upper bound of the springs' stiffness without the pressure of a volume, N/m: k·β + K″·ε on a
 /// mesh, with β and ε as in [`largest_stiffness_n_per_m`], to which it is equal for a tissue without a volume.
 pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
-    scene.body.kind().spring_bound_n_per_m(&scene.springs, scene.anchor_stiffness_n_per_m)
+    scene.body.kind().spring_bound_n_per_m(&stiffest_springs(scene), scene.anchor_stiffness_n_per_m)
 }
 
 /// Returns the approximate factor from rounding errors of displacements, m, to force, N; in N/m. The errors of
@@ -138,7 +144,7 @@ pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
 mod tests {
     #![allow(clippy::cast_precision_loss)]
     use super::*;
-    use crate::scene::{MaxwellBranch, Named, Springs, largest_stiffness_of_a_sheet_n_per_m};
+    use crate::scene::{MaxwellBranch, Named, largest_stiffness_of_a_sheet_n_per_m};
     use crate::scheme::Coefficients;
 
     /// Every scheme.

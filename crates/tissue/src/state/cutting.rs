@@ -1,4 +1,4 @@
-//! What is severed in a step: by the edges of blades (anchor springs in `anchors`), by heat (`burning`), and by strain (`tearing`). And
+//! What is severed in a step: by the edges of blades (anchor springs in `anchors`), by heat (`burning`, which stiffens it first), and by strain (`tearing`). And
 //! between two steps: what a server reports (`reported`).
 //!
 //! In a step the edge of a blade sweeps a surface, from the line between its tip and its heel at the step's beginning to that at
@@ -90,6 +90,19 @@ struct Crossing {
     place: usize,
     spring: SpringEnd,
     part: f64,
+}
+
+/// How far a spring is stretched, seen from one of its ends.
+#[derive(Debug, Clone, Copy)]
+struct Stretch {
+    /// The vector to the other end at rest, m.
+    rest_m: DVec3,
+    /// The displacement of the other end from that, m.
+    delta_m: DVec3,
+    /// L/L0 − 1.
+    extension: f64,
+    /// 1 − L0/L; 0 for a spring of no length, which has no direction.
+    along: f64,
 }
 
 impl Crossing {
@@ -267,7 +280,7 @@ impl<T: Real> TissueState<T> {
         let ends = [place, spring.other];
         let severed =
             SeveredSpring { ends: ends.map(|place| place as u32), number: spring.number as u32, part, version };
-        let (model, layout) = (self.model.clone(), self.tables.layout);
+        let model = self.model.clone();
         if model.places.solid().is_some() {
             return self.sever_face(severed);
         }
@@ -277,17 +290,11 @@ impl<T: Real> TissueState<T> {
         for place in ends {
             self.tiles.wake_around(model.point_of(place), self.plan.scheme.sweeps());
         }
-        let [own_m, other_m] = ends.map(|place| displacement_m(&model, &layout, &self.state, model.point_of(place)));
-        let (rest_m, delta_m) = (model.unit_m * spring.rest, other_m - own_m);
-        // 1 − L0/L without cancellation (`kernel::springs`).
-        let q = ((2.0 * rest_m + delta_m).dot(delta_m) / rest_m.length_squared()).max(-1.0);
-        let s = (1.0 + q).sqrt();
-        let extension = q / (1.0 + s);
+        let Stretch { rest_m, delta_m, extension, along } = self.stretch(place, &spring);
         // The force of the spring, less what a pretension leaves of it.
-        let (tension_n_per_m, slack_n_per_m) =
-            (spring.tension_n_per_m, spring.stiffness_n_per_m - spring.tension_n_per_m);
-        let along = if s > 0.0 { slack_n_per_m * extension / s } else { 0.0 };
-        let force_n = (along + tension_n_per_m) * (rest_m + delta_m);
+        let stiffness_n_per_m = self.tables.severed.burnt().of_spring(ends) * spring.stiffness_n_per_m;
+        let (tension_n_per_m, slack_n_per_m) = (spring.tension_n_per_m, stiffness_n_per_m - spring.tension_n_per_m);
+        let force_n = (slack_n_per_m * along + tension_n_per_m) * (rest_m + delta_m);
         let stored_j = 0.5 * slack_n_per_m * rest_m.length_squared() * extension * extension
             + 0.5 * tension_n_per_m * delta_m.length_squared();
         let released_j = tension_n_per_m * rest_m.dot(delta_m) + stored_j;
@@ -298,7 +305,19 @@ impl<T: Real> TissueState<T> {
         true
     }
 
-    /// Takes the present force of a severed spring on the point at a place, N, out of the past forces that a multistep scheme keeps.
+    /// Returns how far a spring of a place is stretched.
+    fn stretch(&self, place: usize, spring: &SpringEnd) -> Stretch {
+        let (model, layout) = (&self.model, &self.tables.layout);
+        let u_m = |place: usize| displacement_m(model, layout, &self.state, model.point_of(place));
+        let (rest_m, delta_m) = (model.unit_m * spring.rest, u_m(spring.other) - u_m(place));
+        // 1 − L0/L without cancellation (`kernel::springs`).
+        let q = ((2.0 * rest_m + delta_m).dot(delta_m) / rest_m.length_squared()).max(-1.0);
+        let s = (1.0 + q).sqrt();
+        let extension = q / (1.0 + s);
+        Stretch { rest_m, delta_m, extension, along: if s > 0.0 { extension / s } else { 0.0 } }
+    }
+
+    /// Takes a force of a spring on the point at a place, N, out of the past forces that a multistep scheme keeps: that of a severed spring.
     fn take_from_history(&mut self, place: usize, force_n: DVec3) {
         let (model, layout) = (&self.model, self.tables.layout);
         let change = self.plan.spring_unit(&model.scene) / model.relative_mass_at(place) * force_n;

@@ -120,6 +120,12 @@ impl Model {
             let direction = scene.cutting.anchor_direction.unwrap_or_default().to_array();
             [depth_m].into_iter().chain(direction).for_each(|value| add(&value.to_bits().to_le_bytes()));
         }
+        // And one that burns do not make stiffer.
+        let burnt_stiffness_factor = scene.cutting.burnt_stiffness();
+        if burnt_stiffness_factor != 1.0 {
+            add(b"burnt stiffness");
+            add(&burnt_stiffness_factor.to_bits().to_le_bytes());
+        }
         add(&[u8::from(scene.springs.bending)]);
         add(self.plan.integrator.name().as_bytes());
         add(&self.plan.substeps.to_le_bytes());
@@ -269,6 +275,7 @@ fn restored_as<T: Real>(
     sheet.tiles.restore(&parts.tiles)?;
     let fracture_j = checks.number(parts.fracture.now_j)?;
     let cuts = Cuts::restored(&parts.severed, parts.topology_version, fracture_j, model)?;
+    let cuts = cuts.burnt_by(sheet.contacts.burns.stiffness(model));
     sheet.tables.set_severed(model, &cuts);
     sheet.follow_cuts();
 
@@ -347,6 +354,7 @@ fn checkpoint_of<T: Real>(
     let mut contacts = Contacts::restored((&saved.contacts, &parts.ties.at_checkpoint), model, checks)?;
     let SavedBurnTimes { version, at_checkpoint_s, .. } = &parts.burn_times;
     contacts.burns = Burns::restored(&parts.burns.at_checkpoint, at_checkpoint_s, *version, model)?;
+    let cuts = cuts.burnt_by(contacts.burns.stiffness(model));
     let mut applied = Applied::restored(&saved.forces, model, layout, scale, checks)?;
     contacts.follow_cuts(model, cuts.copies());
     if let Some(copies) = cuts.copies() {

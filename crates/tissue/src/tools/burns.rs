@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::body::burnt_stiffness::{self, BurntStiffness};
 use crate::body::model::Model;
 use crate::saved::ensure;
 use crate::shape::PointId;
@@ -30,6 +31,10 @@ struct BurntPlace {
 impl BurntPlace {
     fn burn(&self, rate_hz: f64) -> f64 {
         (f64::from(self.steps) / rate_hz / self.through_s).min(1.0)
+    }
+
+    fn stiffness(&self, model: &Model) -> f64 {
+        burnt_stiffness::of_point(model.scene.cutting.burnt_stiffness(), self.burn(model.scene.stepping.rate_hz))
     }
 
     fn level(&self, rate_hz: f64) -> f64 {
@@ -98,6 +103,16 @@ impl Burns {
     /// Returns the number of steps for which the point at a place in memory has burnt.
     pub(crate) fn steps_at(&self, place: usize) -> u32 {
         self.found(place).map_or(0, |at| self.places[at].steps)
+    }
+
+    /// Returns the factor of the stiffness of the point at a place in memory. `model` is that of the tissue.
+    pub(crate) fn stiffness_at(&self, place: usize, model: &Model) -> f64 {
+        self.found(place).map_or(1.0, |at| self.places[at].stiffness(model))
+    }
+
+    /// Returns the points that these burns make stiffer. `model` is that of the tissue.
+    pub(crate) fn stiffness(&self, model: &Model) -> BurntStiffness {
+        BurntStiffness::of(self.places.iter().map(|burnt| (burnt.place, burnt.stiffness(model))))
     }
 
     /// Adds a step to the points at places in memory, each with the time in which it burns through there, s.

@@ -1,4 +1,5 @@
-//! The severed springs of a sheet as its sweep reads them: factors of 0 and 1, for rows with cuts only, and the anchors that are left.
+//! The severed and the burnt springs of a sheet as its sweep reads them: factors of their stiffness, 0 for a severed one, for rows with such springs
+//! only, and the anchors that are left.
 
 use crate::body::severed::NO_ANCHOR;
 use crate::kernel::field::{Field, Layout};
@@ -20,7 +21,7 @@ const SPRINGS: usize = 6;
 #[derive(Debug)]
 pub(crate) struct SheetCuts<T> {
     stride: usize,
-    /// For each row with cuts the factors of its springs, [`SPRINGS`] rows of the layout. Empty if no row has any.
+    /// For each row with cuts or burns the factors of its springs, [`SPRINGS`] rows of the layout. Empty if no row has any.
     rows: Vec<Option<Box<Field<T>>>>,
     /// The extra K″/m of each point divided by the reference value, a plane of the layout. `None` if no anchor spring is severed.
     anchors: Option<Field<T>>,
@@ -63,8 +64,8 @@ impl<T: Real> SheetCuts<T> {
         self.anchors = None;
     }
 
-    /// Severs or restores the spring that joins the point [i, j] to the one `di` rows and `dj` columns on.
-    pub(crate) fn set(&mut self, layout: &Layout, [i, j]: [usize; 2], [di, dj]: [isize; 2], is_severed: bool) {
+    /// Sets the factor of the spring that joins the point [i, j] to the one `di` rows and `dj` columns on.
+    pub(crate) fn set(&mut self, layout: &Layout, [i, j]: [usize; 2], [di, dj]: [isize; 2], factor: f64) {
         // From its upper end, or its left one, on.
         let (i, j, [di, dj]) = if di < 0 || di == 0 && dj < 0 {
             (i.wrapping_add_signed(di), j.wrapping_add_signed(dj), [-di, -dj])
@@ -88,6 +89,6 @@ impl<T: Real> SheetCuts<T> {
             factors.fill(T::of(1.0));
             Box::new(factors)
         });
-        factors[spring * stride + j] = T::of(if is_severed { 0.0 } else { 1.0 });
+        factors[spring * stride + j] = T::of(factor);
     }
 }

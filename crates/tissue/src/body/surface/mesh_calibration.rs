@@ -58,7 +58,7 @@ impl MeshTrial {
         let FreeMotion { slots, unit, pull, state, .. } = &self.0;
         let slot = slots.slot_of()[vertex] as usize;
         DVec3::from_array(
-            gather(slots, unit, (*pull, slots.extra_of(slot)), None, &state.u, slot, |_| false).map(f64::from),
+            gather(slots, unit, (*pull, slots.extra_of(slot)), None, &state.u, slot, |_, _| 1.0).map(f64::from),
         )
     }
 }

@@ -163,20 +163,20 @@ impl<T: Real> MeshSprings<T> {
         }
     }
 
-    /// Severs or restores the spring of a slot that has this number, at this end. The others stay as they are.
-    pub(crate) fn set(&mut self, slots: &MeshSlots, slot: usize, number: usize, is_severed: bool) {
+    /// Changes the factor of the stiffness of the spring of a slot that has this number, at this end, from one value to another; 0: it is severed. The
+    /// others stay as they are.
+    pub(crate) fn set(&mut self, slots: &MeshSlots, slot: usize, number: usize, factors: [f64; 2]) {
         let half = &slots.springs(slot)[number];
         let values = coefficients::<T>(half);
         let stiffness = STIFFNESS * self.shape.lanes;
-        let is_right_stiffness =
-            |stiffness: T| if is_severed { stiffness == values[STIFFNESS] } else { stiffness == T::default() };
+        let [from, to] = factors.map(|factor| T::of(factor * half.stiffness));
         let set = |row: &mut [T], lane: usize| {
             let lanes = row.len() / COEFFICIENTS;
             let is_this = (0..STIFFNESS).all(|which| row[which * lanes + lane] == values[which]);
-            // Several springs may join the same points: one that is whole and as stiff, or one that is severed.
-            let is_found = is_this && is_right_stiffness(row[stiffness + lane]);
+            // Several springs may join the same points: one that is as stiff as this one is now.
+            let is_found = is_this && row[stiffness + lane] == from;
             if is_found {
-                row[stiffness + lane] = if is_severed { T::default() } else { values[STIFFNESS] };
+                row[stiffness + lane] = to;
             }
             is_found
         };

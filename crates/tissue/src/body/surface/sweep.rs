@@ -622,7 +622,8 @@ impl<V: Vector> Strain<V> {
 }
 
 /// Returns the force of the springs and of the extra anchor stiffness on one slot, minus the pressure
-/// `pressed`. `extra` is the extra K″/m divided by the reference value, if the slots differ in it. Of a spring that `is_severed`, by its number, only the load that held the rest shape against its pretension is left. For a few single points. `unit` and `pull` as in [`MeshGrid`].
+/// `pressed`. `extra` is the extra K″/m divided by the reference value, if the slots differ in it. `factor` gives the factor of the stiffness of each spring from its
+/// number and the slot of its other end; 0: it is severed, and only the load that held the rest shape against its pretension is left. For a few single points. `unit` and `pull` as in [`MeshGrid`].
 #[inline(always)]
 pub(crate) fn gather<T: Real>(
     slots: &MeshSlots,
@@ -631,20 +632,22 @@ pub(crate) fn gather<T: Real>(
     pressed: Option<(T, [T; 3])>,
     u: &[T],
     slot: usize,
-    is_severed: impl Fn(usize) -> bool,
+    factor: impl Fn(usize, usize) -> f64,
 ) -> [T; 3] {
     let plane = slots.layout::<T>().plane;
     let at = |slot: usize| std::array::from_fn(|c| Scalar(u[c * plane + slot]));
     let own: [Scalar<T>; 3] = at(slot);
     let mut sum = Sum::zero(&own);
     for (number, half) in slots.springs(slot).iter().enumerate() {
-        let coefficients = coefficients::<T>(half);
-        if is_severed(number) {
+        let mut coefficients = coefficients::<T>(half);
+        let factor = factor(number, half.to as usize);
+        if factor == 0.0 {
             for c in 0..3 {
                 sum.force[c] = sum.force[c].minus(Scalar(unit.tension * coefficients[4]), Scalar(coefficients[c]));
             }
             continue;
         }
+        coefficients[4] = T::of(factor * half.stiffness);
         // SAFETY: the coefficients are those of a row of one spring.
         unsafe {
             let strain = Strain::of(&at(half.to as usize), &own, coefficients.as_ptr());

@@ -186,7 +186,7 @@ fn pulls_as_the_reference<T: Real>() {
                 assert!(near, "{count} {valence} {strain} {vertex}: {found} {force} ± {within}");
                 let slot = slots.slot_of()[vertex] as usize;
                 let unit = SpringCoefficients::<T>::new(SCALE, 1.0);
-                let alone = gather(&slots, &unit, (T::of(PULL), slots.extra_of(slot)), None, &u, slot, |_| false);
+                let alone = gather(&slots, &unit, (T::of(PULL), slots.extra_of(slot)), None, &u, slot, |_, _| 1.0);
                 let swept = std::array::from_fn(|c| n[c * slots.layout::<T>().plane + slot]);
                 assert_eq!(alone, swept, "{count} {valence} {strain} {vertex}");
             }
@@ -281,7 +281,7 @@ fn a_flat_mesh_with_a_sheets_springs_pulls_as_the_sheet_does() {
             let (n, _) = sweep_all::<f32, false>(&slots, Lanes::Auto, &u);
             let most = n.iter().fold(0.0_f32, |most, n| most.max(n.abs()));
             for index in 0..rows * columns {
-                let truth = sheets_springs.gather(&sheet, &sheets_u, [index / columns, index % columns], |_| false);
+                let truth = sheets_springs.gather(&sheet, &sheets_u, [index / columns, index % columns], |_, _| 1.0);
                 let found = u_of(&slots, &n, index as u32);
                 let away = found.distance(DVec3::from_array(truth.map(f64::from)));
                 assert!(away <= 1e-6 * f64::from(most), "{strain} {index}: {found} {truth:?}");

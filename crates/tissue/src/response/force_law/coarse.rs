@@ -10,7 +10,7 @@
 //! load farther. There it is the law of the whole with larger cells, refined in the same way by the points around the disc
 //! with the two sizes of cells.
 //!
-//! A law near a cut is that of the points around the disc too: sheets of other points have no cuts.
+//! A law near a cut or a burn is that of the points around the disc too: sheets of other points have none.
 
 use std::f64::consts::PI;
 use std::sync::atomic::AtomicBool;
@@ -70,7 +70,7 @@ pub fn first(model: &Model, cuts: &Cuts, disc: Disc, stop: &AtomicBool) -> Optio
     let exact = follow(model, cuts, course(disc, EXACT_ROWS), Accuracy::EXACT, &mut work, stop);
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
-        if model.shape().is_uniform() && !cuts.is_empty() {
+        if model.shape().is_uniform() && !cuts.are_none() {
             return of_fewer_points(model, cuts, disc, usize::MAX, &mut left, stop);
         }
         if !model.shape().is_uniform() {

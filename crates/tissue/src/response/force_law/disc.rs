@@ -49,8 +49,8 @@ impl Disc {
         is_near.then_some(feel.anchor_m)
     }
 
-    /// Returns whether the law of this disc differs from that of the whole tissue: whether anything is severed at most half as far from its
-    /// rim as points notice a press, which is e⁻⁶ of the stiffness on anchor springs, in a solid 8 radii.
+    /// Returns whether the law of this disc differs from that of the whole tissue: whether anything is severed, or stiffer by a burn, at most half
+    /// as far from its rim as points notice a press, which is e⁻⁶ of the stiffness on anchor springs, in a solid 8 radii.
     pub fn notices(&self, model: &Model, cuts: &Cuts) -> bool {
         let beyond_m = 0.5 * (half_window_m(model, self.radius_m) - self.radius_m);
         let most_m = NOTICES_IN_RADII * self.radius_m;

@@ -3,20 +3,25 @@
 //! A tip burns the points that its disc covers, the same that it presses or holds, for as long as it touches or holds them. Their times of contact
 //! add up, under one tip or several, and stay when the tip goes. A spring is severed in its middle once both of its ends have burnt
 //! for as long as the tip that is at one of them takes (`Tip::burn_s`), and springs that resist bending go as in a tear
-//! (`tearing`). The anchor spring of a point that has burnt for so long is severed too, if anchors can be (`anchors`). Before that, the
-//! tissue does not become stiffer.
+//! (`tearing`). The anchor spring of a point that has burnt for so long is severed too, if anchors can be (`anchors`).
+//!
+//! **Stiffness.** Before that the springs of burnt points become stiffer, if the scene says so (`body::burnt_stiffness`), a level at a time. As with a
+//! severed spring, the past forces that a multistep scheme keeps change as if the spring had always been so stiff. What a stretched spring
+//! then stores more, the heat has given it. Without a tip that burns nothing is computed.
 
 use std::collections::BTreeMap;
 
-use super::Crossing;
+use super::{Crossing, Stretch};
+use crate::body::tables::StiffenedSpring;
 use crate::kernel::real::Real;
 use crate::state::tissue_state::TissueState;
+use crate::tools::contact::Contacts;
 use palpate_haptics::ContactState;
 
 impl<T: Real> TissueState<T> {
     /// Burns what lies under tips that burn for a step. Returns the whole springs that this severs; some perhaps twice.
     pub(super) fn burnt(&mut self) -> Vec<Crossing> {
-        let TissueState { model, tables, contacts, .. } = self;
+        let TissueState { model, contacts, .. } = self;
         let burning = contacts.tools.iter().filter(|tool| tool.tip.burn_s > 0.0);
         let touching = burning.filter(|tool| tool.contact_state != ContactState::Free);
         let under: Vec<(f64, Vec<usize>)> = touching
@@ -34,6 +39,8 @@ impl<T: Real> TissueState<T> {
             quickest.entry(place).and_modify(|least_s| *least_s = least_s.min(burn_s)).or_insert(burn_s);
         }
         burns.add_step(&quickest, model.scene.stepping.rate_hz);
+        self.stiffen(quickest.into_keys());
+        let TissueState { model, tables, contacts: Contacts { burns, .. }, .. } = &*self;
         let (mut found, mut through) = (Vec::new(), Vec::new());
         for (burn_s, places) in under {
             let is_through = |place| f64::from(burns.steps_at(place)) / model.scene.stepping.rate_hz >= burn_s;
@@ -51,6 +58,39 @@ impl<T: Real> TissueState<T> {
         found.extend(bending);
         found.extend(through.into_iter().filter_map(|place| self.anchor_in_middle(place)));
         found
+    }
+
+    /// Makes the springs of some points as stiff as their burns have made them.
+    fn stiffen(&mut self, places: impl Iterator<Item = usize>) {
+        let model = self.model.clone();
+        if model.scene.cutting.burnt_stiffness() == 1.0 {
+            return;
+        }
+        let mut burnt = self.tables.severed.burnt().clone();
+        let mut is_changed = false;
+        for place in places {
+            let factor = self.contacts.burns.stiffness_at(place, &model);
+            if factor != burnt.of_point(place) {
+                burnt.set(place, factor);
+                is_changed = true;
+            }
+        }
+        if !is_changed {
+            return;
+        }
+        for StiffenedSpring { place, spring, factors: [was, now] } in self.tables.set_burnt(&model, burnt) {
+            let Stretch { rest_m, delta_m, extension, along } = self.stretch(place, &spring);
+            let added_n_per_m = (now - was) * spring.stiffness_n_per_m;
+            let force_n = added_n_per_m * along * (rest_m + delta_m);
+            self.take_from_history(place, -force_n);
+            self.take_from_history(spring.other, force_n);
+            self.work.add(0.5 * added_n_per_m * rest_m.length_squared() * extension * extension);
+            for place in [place, spring.other] {
+                self.tiles.wake_around(model.point_of(place), self.plan.scheme.sweeps());
+            }
+        }
+        // A twin that steps otherwise reaches a level in another step: that is no error of the stepping.
+        self.audit_window.give_up();
     }
 }
 

@@ -326,3 +326,5 @@ fn tips_that_cannot_burn_are_refused() {
     let refusal = check_tip("tip", solid.shape(), &burning(0.005)).unwrap_err();
     assert_eq!((&*refusal.field, refusal.reason), ("tip.burn_s", Reason::WrongKind));
 }
+
+mod stiffness;
