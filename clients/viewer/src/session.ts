@@ -9,9 +9,10 @@ import { type Session, TipShape } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { Hands } from "./hands";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
-import { type Failure, isUnimplemented, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
+import { type Failure, keepOpen, CALL_TIMEOUT_MS, server, sessions, sleep } from "./server";
 import { gridOf, Sheet } from "./sheet";
 import type { Place, Surface } from "./surface";
+import { VersionFollower } from "./version-follower";
 
 /** Interval between two requests for the session's status. */
 const ASK_MS = 1000;
@@ -88,11 +89,8 @@ export class ShownSession {
   readonly burning: Burning;
   /** The longest time that the page has worked on one change of the wound, ms. */
   longestCutMs = 0;
-  /** The newest version of the topology that the server has told of. */
-  private cutVersion = 0;
-  private isFollowing = false;
-  /** Whether this server's wounds can be shown; if not, the surface stays whole. */
-  private canFollow = true;
+  /** Follows the versions of the topology; if this server's wounds can't be shown, the surface stays whole. */
+  private readonly cuts: VersionFollower;
   /** Whether what is drawn may be the wound of another session. */
   private hasFormerWound = false;
   /** The moments before the cuts that this page saw, also in the sessions from which this one goes on. */
@@ -168,7 +166,7 @@ export class ShownSession {
     this.surface ??= former?.surface ?? this.newSheet();
     this.wound = this.newWound();
     this.hasFormerWound = former !== undefined && (former.hasFormerWound || former.wound.version > 0);
-    this.cutVersion = session.topologyVersion;
+    this.cuts = new VersionFollower((newest) => this.hasFormerWound || this.wound.version < newest, () => this.askForCuts(), this.ended.signal);
     this.burning = new Burning(session.sessionId, this.surface, this.refinement, former !== undefined, this.ended.signal, () => this.told.onCut());
     this.beforeCuts = session.playback ? [] : (former?.beforeCuts ?? []);
     this.frames.onFrame = (frame) => this.framed(frame);
@@ -241,45 +239,31 @@ export class ShownSession {
   begin(): void {
     void this.ask();
     this.look();
-    void this.followCuts();
+    this.cuts.heard(this.session.topologyVersion);
     this.burning.heard(0);
   }
 
   private framed(frame: FrameTold): void {
     this.told.onFrame();
     this.noteMoment(frame);
-    this.cutVersion = Math.max(this.cutVersion, frame.topologyVersion);
-    void this.followCuts();
+    this.cuts.heard(frame.topologyVersion);
     this.burning.heard(frame.burnVersion);
   }
 
-  /** Asks for what blades have cut since, one request at a time, until it is as new as what the server has told of. */
-  private async followCuts(): Promise<void> {
-    if (this.isFollowing || !this.canFollow) return;
-    this.isFollowing = true;
+  /** Asks for what blades have cut since, and shows it. */
+  private async askForCuts(): Promise<void> {
+    const { surface, wound } = this;
     const { signal } = this.ended;
-    try {
-      while (!signal.aborted && (this.hasFormerWound || this.wound.version < this.cutVersion)) {
-        const { surface, wound } = this;
-        const { version } = wound;
-        const change = await followWound(server, this.session.sessionId, this.refinement, wound, signal);
-        if (signal.aborted) return;
-        // Another refinement has another wound.
-        if (surface !== this.surface) continue;
-        this.hasFormerWound = false;
-        const begunMs = performance.now();
-        surface.wound.take(wound, change);
-        this.longestCutMs = Math.max(this.longestCutMs, performance.now() - begunMs);
-        this.told.onCut();
-        if (wound.version === version) await sleep(WOUND_MS, signal);
-      }
-    } catch (error) {
-      this.canFollow = !(error instanceof RangeError || isUnimplemented(error));
-      // Another failure is told by the streams, and a later frame asks again.
-      await sleep(ASK_MS, signal);
-    } finally {
-      this.isFollowing = false;
-    }
+    const { version } = wound;
+    const change = await followWound(server, this.session.sessionId, this.refinement, wound, signal);
+    // Another refinement has another wound.
+    if (signal.aborted || surface !== this.surface) return;
+    this.hasFormerWound = false;
+    const begunMs = performance.now();
+    surface.wound.take(wound, change);
+    this.longestCutMs = Math.max(this.longestCutMs, performance.now() - begunMs);
+    this.told.onCut();
+    if (wound.version === version) await sleep(WOUND_MS, signal);
   }
 
   /** Notes the moment before a cut that begins. */
@@ -340,7 +324,7 @@ export class ShownSession {
     this.refinement = n;
     this.surface = this.newSheet();
     this.wound = this.newWound();
-    void this.followCuts();
+    void this.cuts.follow();
     this.burning.refine(this.surface, n);
     if (!this.seen.signal.aborted) this.watch();
     return this.surface;
@@ -406,8 +390,7 @@ export class ShownSession {
   private heard(session: Session, begunMs: number, endedMs: number): void {
     this.noteCutters(this.session, session);
     this.session = session;
-    this.cutVersion = Math.max(this.cutVersion, session.topologyVersion);
-    void this.followCuts();
+    this.cuts.heard(session.topologyVersion);
     this.heardMs = endedMs;
     this.askedMs = begunMs;
     const roundTripMs = endedMs - begunMs;
