@@ -6,9 +6,9 @@ use palpate_haptics::{Instrument, Predictor};
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 use tokio::sync::Semaphore;
-use tokio::task::JoinSet;
 
 use super::Copies;
+use super::background_call::BackgroundCall;
 use super::copy_thread::{self, MadeCopy};
 use super::cut_fetch::CutsFollower;
 use crate::Error;
@@ -39,8 +39,7 @@ pub(super) struct Copying {
     instrument: Instrument,
     /// `None`: this tissue is not copied.
     copier: Option<Copier>,
-    /// At most one task, which is aborted when this is dropped.
-    under_way: JoinSet<Result<MadeCopy, Error>>,
+    call: BackgroundCall<MadeCopy>,
     follower: CutsFollower,
 }
 
@@ -60,7 +59,7 @@ impl Copying {
         let copier = copier.filter(|copier| !is_hidden && (!is_grid || copier.copies.of_grids)).cloned();
         let session_id = session.session_id.clone();
         let follower = CutsFollower::new(channel.clone(), session_id.clone());
-        Copying { channel, session_id, instrument, copier, under_way: JoinSet::new(), follower }
+        Copying { channel, session_id, instrument, copier, call: BackgroundCall::none(), follower }
     }
 
     /// Returns whether this tissue is copied.
@@ -71,12 +70,11 @@ impl Copying {
     /// Starts building a copy of the current tissue. Aborts an earlier one that is not finished.
     pub(super) fn begin(&mut self) {
         self.follower.follow(None);
-        self.under_way.abort_all();
-        self.under_way.detach_all();
+        self.call.abort();
         let Some(Copier { copies: Copies { make, .. }, places }) = self.copier.clone() else { return };
         let (channel, session_id, instrument) =
             (self.channel.clone(), self.session_id.clone(), self.instrument.clone());
-        self.under_way.spawn(async move {
+        self.call.begin(async move {
             let none = |_| Error::Internal("no copy of the tissue is made any more".to_owned());
             let permit = places.acquire_owned().await.map_err(none)?;
             let request = pb::SaveSnapshotRequest { session_id };
@@ -98,8 +96,8 @@ impl Copying {
     pub(super) async fn next(&mut self) -> Result<Box<dyn Predictor>, Error> {
         loop {
             tokio::select! {
-                Some(made) = self.under_way.join_next() => {
-                    let made = made.map_err(|_| Error::Internal("fetching the tissue panicked".to_owned())).flatten()?;
+                made = self.call.result() => {
+                    let made = made?;
                     self.follower.follow(made.cuts);
                     return Ok(made.copy);
                 }

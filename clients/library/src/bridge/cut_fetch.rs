@@ -9,9 +9,9 @@ use std::time::Duration;
 use palpate_haptics::{ReportedCuts, ReportedSpring};
 use palpate_proto::pb;
 use pb::view_service_client::ViewServiceClient;
-use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 
+use super::background_call::BackgroundCall;
 use super::copy_thread::CutsWriter;
 use crate::Error;
 use crate::connect::Channel;
@@ -32,8 +32,7 @@ pub(super) struct CutsFollower {
     session_id: String,
     /// `None`: there is no copy, or it follows no cuts.
     copy: Option<CutsWriter>,
-    /// At most one call, which is aborted when this is dropped.
-    under_way: JoinSet<Result<ReportedCuts, Error>>,
+    call: BackgroundCall<ReportedCuts>,
     /// The earliest time of the next call.
     next: Instant,
 }
@@ -41,25 +40,24 @@ pub(super) struct CutsFollower {
 impl CutsFollower {
     /// Creates a follower without a copy.
     pub(super) fn new(channel: Channel, session_id: String) -> Self {
-        CutsFollower { channel, session_id, copy: None, under_way: JoinSet::new(), next: Instant::now() }
+        CutsFollower { channel, session_id, copy: None, call: BackgroundCall::none(), next: Instant::now() }
     }
 
     /// Follows for another copy from now on; `None`: for none.
     pub(super) fn follow(&mut self, copy: Option<CutsWriter>) {
-        self.under_way.abort_all();
-        self.under_way.detach_all();
+        self.call.abort();
         self.copy = copy;
     }
 
     /// Begins a call if the copy lacks a version of the topology and none is under way.
     pub(super) fn look(&mut self, topology_version: u32) {
         let Some(copy) = self.copy.as_ref().filter(|copy| copy.version() < topology_version) else { return };
-        if !self.under_way.is_empty() {
+        if self.call.is_under_way() {
             return;
         }
         let (channel, session_id, since_version) = (self.channel.clone(), self.session_id.clone(), copy.version());
         let next = self.next;
-        self.under_way.spawn(async move {
+        self.call.begin(async move {
             sleep_until(next).await;
             let late = |_| Error::Connection("the server does not tell in time what is severed".to_owned());
             timeout(CALL_TIMEOUT, fetch(channel, session_id, since_version)).await.map_err(late)?
@@ -69,20 +67,19 @@ impl CutsFollower {
     /// Waits for the call under way, if any, and passes its report to the copy. Never returns without a call. Dropping the future loses
     /// nothing.
     pub(super) async fn passed_on(&mut self) {
-        let Some(fetched) = self.under_way.join_next().await else { return std::future::pending().await };
-        let pause = match fetched {
-            Ok(Ok(cuts)) => {
+        let pause = match self.call.result().await {
+            Ok(cuts) => {
                 // The server tells its state of some steps ago, which may be before a snapshot.
                 if let Some(copy) = self.copy.as_mut().filter(|copy| copy.version() <= cuts.version) {
                     copy.report(cuts);
                 }
                 Duration::from_secs_f64(RATE_HZ.recip())
             }
-            Ok(Err(Error::Call(status))) if is_final(&status) => {
+            Err(Error::Call(status)) if is_final(&status) => {
                 self.copy = None;
                 PAUSE
             }
-            Ok(Err(_)) | Err(_) => PAUSE,
+            Err(_) => PAUSE,
         };
         self.next = Instant::now() + pause;
     }

@@ -6,6 +6,7 @@
 //! When the connection breaks, the network side connects again. Forces return when the operator requests them.
 //! Commands that could not be sent in the meantime are dropped: outdated ones are never replayed.
 
+mod background_call;
 mod copy_fetch;
 mod copy_thread;
 mod cut_button;
