@@ -232,14 +232,14 @@ bench-frames: need-rust
 # (`PALPATE_STRESS_THIN=10000` takes hours), five thousand snapshots that are restored, and a million severed springs.
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_SOLIDS=1000 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 PALPATE_STRESS_CUTS=1000000 \
-		$(CARGO) test --release --test offline -- stress:: legal:: thin:: restored:: cuts:: --include-ignored --nocapture
+		$(CARGO) test --release --test without_server -- stress:: legal:: thin:: restored:: cuts:: --include-ignored --nocapture
 	$(CARGO) test --release --test physics -- --include-ignored --nocapture
 
 # Random cuts alone: CUTS severed springs and faces, from the random seed FROM on, with progress.
 CUTS ?= 1000000
 FROM ?= 0
 stress-cuts: need-rust
-	PALPATE_STRESS_CUTS=$(CUTS) PALPATE_STRESS_CUTS_FROM=$(FROM) $(CARGO) test --release --test offline -- cuts:: --nocapture
+	PALPATE_STRESS_CUTS=$(CUTS) PALPATE_STRESS_CUTS_FROM=$(FROM) $(CARGO) test --release --test without_server -- cuts:: --nocapture
 
 # The unit tests of the tissue, and the golden hashes.
 KERNEL := --package palpate-tissue --package palpate --lib --test determinism
@@ -405,7 +405,7 @@ soak: need-rust
 	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --workspace --test server -- kill:: --skip journal_kill:: --nocapture
 	PALPATE_JOURNAL_KILLS=$(JOURNAL_KILLS) PALPATE_JOURNAL_SESSIONS=20 \
 		$(CARGO) test --release --workspace --test server -- journal_kill:: --nocapture
-	PALPATE_LONG=1 $(CARGO) test --release --test offline -- journal:: --nocapture
+	PALPATE_LONG=1 $(CARGO) test --release --test without_server -- journal:: --nocapture
 	PALPATE_LONG=1 $(CARGO) test --release --workspace --test server -- no_step_waits_for_a_disk_that_stalls --nocapture
 
 # Each seed is another siege; the first failure is said as it is found, all of them at the end.

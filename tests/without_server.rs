@@ -1,5 +1,5 @@
 //! Everything that needs no running server, in one program: each would link the tissue and the sessions again.
-//! `cargo test --release --test offline solid::` runs one file of it.
+//! `cargo test --release --test without_server solid::` runs one file of it.
 #![allow(clippy::unwrap_used)]
 
 #[path = "common"]
