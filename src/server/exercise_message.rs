@@ -100,7 +100,7 @@ pub(super) fn moment(live: &LiveExercise, moment: &MomentFigures, is_trainee: bo
         figures: figures(moment.figures.iter().filter(told)),
         score_percent: moment.score.as_ref().filter(|_| !is_trainee).map(|score| score.percent),
         phase: u32::try_from(moment.phases.len()).unwrap_or(u32::MAX),
-        phase_time_s: moment.phases.last().map_or(0.0, |phase| time_s(live, phase.steps[0], moment.step)),
+        phase_time_s: moment.phases.last().map_or(0.0, |phase| time_s(live, phase.begin_step, moment.step)),
         ..Default::default()
     }
 }
@@ -133,9 +133,9 @@ pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: boo
         diameter_m: answer.mark.diameter_m,
     };
     let phase = |phase: &PhaseFigures| pb::PhaseResult {
-        begin_step: phase.steps[0],
-        step: phase.steps[1],
-        time_s: time_s(live, phase.steps[0], phase.steps[1]),
+        begin_step: phase.begin_step,
+        step: phase.end_step,
+        time_s: time_s(live, phase.begin_step, phase.end_step),
         figures: figures(phase.figures.iter()),
     };
     pb::ExerciseResult {

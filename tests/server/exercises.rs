@@ -378,6 +378,42 @@ async fn phases_end_by_the_trainee_or_by_their_time_and_the_journal_gives_their_
     assert_eq!(json["exercise"]["score_percent"].as_f64(), Some(50.0));
 }
 
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_journal_that_begins_anew_in_a_later_phase_has_the_ends_of_those_before() {
+    let folder = tempfile::tempdir().unwrap();
+    // No file may have more than 1.5 MiB.
+    let script = "trap '' XFSZ; ulimit -f 3000; exec \"$0\" serve --listen 127.0.0.1:0 --log error --journal \"$1\"";
+    let server = TestServer::by_script(script, &[folder.path().as_os_str()]);
+    let text = "name = \"mine\"\ninstructions = \"Press.\"\nscenes = [\"phantom\"]\n\
+                [[phase]]\ntitle = \"One\"\ninstructions = \"Press.\"\n[[phase]]\ntitle = \"Two\"\ninstructions = \"Press.\"\n";
+    let source = Some(pb::chosen_exercise::Source::Text(text.to_owned()));
+    let chosen = pb::ChosenExercise { source, ..Default::default() };
+    let session_id = server.create(Source::Exercise(chosen), false).await.unwrap().session_id;
+    assert_eq!(end(&server, &session_id, 1).await.unwrap(), None);
+    let mut touch = TestTouch::hold(&server, &session_id).await;
+    let (mut sequence, mut run) = (0, 1);
+    let second_file = async {
+        while run == 1 {
+            for depth_mm in (0..50).chain((0..50).rev()) {
+                sequence += 1;
+                touch.command(pose(sequence, [0.01, 0.0, 0.043 - 0.0001 * f64::from(depth_mm)])).await;
+                touch.sample().await;
+            }
+            let journal = server.status(&session_id).await.journal.unwrap();
+            run = if journal.fault.is_empty() { journal.run } else { 1 };
+        }
+    };
+    tokio::time::timeout(TEST_TIMEOUT, second_file).await.expect("the journal does not begin anew");
+    let result = finish(&server, &session_id).await;
+    assert_eq!(result.phases.len(), 2);
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: session_id.clone() }).await.unwrap();
+    let (_, json) = score(&folder.path().join(format!("{session_id}.{run}.mcap")), &[]).unwrap();
+    let [one, two] = &json["exercise"]["phases"].as_array().unwrap()[..] else { panic!("{json}") };
+    assert_eq!((one["steps"].as_u64(), two["begin_step"].as_u64()), (Some(0), json["begin_step"].as_u64()));
+    assert!(two["steps"].as_u64().unwrap() > 0, "{two}");
+}
+
 #[tokio::test]
 async fn after_a_crash_a_session_has_its_exercise_its_ids_and_its_result() {
     let folder = tempfile::tempdir().unwrap();

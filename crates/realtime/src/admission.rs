@@ -168,6 +168,10 @@ impl Pacer {
         let model = self.model_of(scene, stop)?;
         let of_exercise = |chosen: ChosenExercise| {
             let plain = self.plain_of(&chosen, &model, stop)?;
+            // The presses step two tissues, which are gone when the session begins.
+            let pressed_bytes = if chosen.lump_to_press().is_some() { 2 * model.session_bytes() } else { 0 };
+            let points_key = model.scene.body.kind().points_key();
+            let _pressed = owner.take(Resource::Memory(Purpose::Session), pressed_bytes, points_key)?;
             let chosen = with_noticed_pressure(chosen, &model, &self.limits, stop);
             let chosen = chosen.map_err(|refusal| refusal.within("exercise"))?;
             Ok(SessionExercise { chosen, trainee_id: random_id()?, plain, ended: None })

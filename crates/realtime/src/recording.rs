@@ -42,9 +42,12 @@ impl SessionTask {
         if recorder.event_log.begins_anew(|| Beginning { step, running, until_step }) {
             *recorder = Recorder::new(&recorder.event_log, session);
             self.handle.note_waiting(&lock(&self.handle.intake));
-            // The result is that of the session, not of a log.
-            let ended = self.handle.exercise.as_ref().and_then(|exercise| exercise.news().borrow().ended.clone());
-            ended.into_iter().for_each(|ended| self.note_input(Input::ExerciseEnded(ended)));
+            // What has ended is that of the session, not of a log.
+            let Some(news) = self.handle.exercise.as_ref().map(|exercise| exercise.news().borrow().clone()) else {
+                return;
+            };
+            (1..news.phase).for_each(|ended| self.note_input(Input::PhaseEnded(ended)));
+            news.ended.into_iter().for_each(|ended| self.note_input(Input::ExerciseEnded(ended)));
         }
     }
 

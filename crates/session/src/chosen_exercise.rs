@@ -5,7 +5,7 @@ use std::sync::Arc;
 use palpate_exercise::{MeasureOptions, ToolLimits};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
-use palpate_tissue::scene::exercise::{CoverageTask, Exercise, Lump};
+use palpate_tissue::scene::exercise::{CoverageTask, Exercise, FeltLump, Lump};
 
 /// An exercise and its hidden truth.
 #[derive(Debug, Clone)]
@@ -53,6 +53,14 @@ impl ChosenExercise {
             coverage_pa: coverage_pa.unwrap_or(usual.coverage_pa),
             seen_along: Some(*seen_along),
             ..usual
+        }
+    }
+
+    /// Returns the lump of its `[coverage]` if the pressure from which on it is felt is not known yet: two presses tell it.
+    pub fn lump_to_press(&self) -> Option<&FeltLump> {
+        match &self.exercise.coverage {
+            Some(CoverageTask::Lump(lump)) if self.noticed_pressure_pa.is_none() => Some(lump),
+            _ => None,
         }
     }
 

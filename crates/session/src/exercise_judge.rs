@@ -55,12 +55,12 @@ pub struct EarnedCriterion {
 /// The figures of a phase.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PhaseFigures {
-    /// Number of steps done at its beginning and, so far, at its end.
-    pub steps: [u64; 2],
+    /// Number of steps done at its beginning.
+    pub begin_step: u64,
+    /// Number of steps done at its end, or so far.
+    pub end_step: u64,
     /// The figures that need no truth, then those of the exercise.
     pub figures: Vec<Figure>,
-    /// Whether the trainee has done anything in it.
-    pub has_acted: bool,
 }
 
 /// The score of an exercise.
@@ -181,16 +181,16 @@ impl ExerciseJudge {
         &self.tasks
     }
 
-    /// Returns the score by all figures, also those that need no truth, and by those of the phases so far; `None` without a criterion. A
+    /// Returns the score by all figures, also those that need no truth, and by those of the phases so far, each
+    /// with whether anything was done in it; `None` without a criterion. A
     /// trainee who has done nothing earns nothing, though nothing was done wrong, and so in each phase.
-    pub fn score(&self, figures: &[Figure], phases: &[PhaseFigures]) -> Option<ExerciseScore> {
+    pub(crate) fn score(&self, figures: &[Figure], phases: &[(&[Figure], bool)]) -> Option<ExerciseScore> {
         let earned = |criterion: &Criterion| {
             let (figures, has_acted) = match criterion.phase {
                 None => (figures, self.has_acted),
-                Some(phase) => (phase as usize)
-                    .checked_sub(1)
-                    .and_then(|index| phases.get(index))
-                    .map_or((&[][..], false), |phase| (&phase.figures[..], phase.has_acted)),
+                Some(phase) => {
+                    (phase as usize).checked_sub(1).and_then(|index| phases.get(index)).copied().unwrap_or((&[], false))
+                }
             };
             let of_all = |figure: &&Figure| figure.definition.name == criterion.measure && figure.tool.is_none();
             // A measure of single tools counts by the worst of them.

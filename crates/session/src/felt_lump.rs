@@ -15,7 +15,7 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
-use palpate_tissue::scene::exercise::{CoverageTask, FeltLump, Lump};
+use palpate_tissue::scene::exercise::{FeltLump, Lump};
 
 use super::chosen_exercise::ChosenExercise;
 use super::press::{ImposedPress, on_surface};
@@ -43,9 +43,7 @@ pub fn with_noticed_pressure(
     limits: &Limits,
     stop: &AtomicBool,
 ) -> Result<ChosenExercise> {
-    let (Some(CoverageTask::Lump(lump)), None) = (&chosen.exercise.coverage, chosen.noticed_pressure_pa) else {
-        return Ok(chosen);
-    };
+    let Some(lump) = chosen.lump_to_press() else { return Ok(chosen) };
     let place = || Some(format!("exercise {}", chosen.exercise.name));
     let found = memory::attempt("", || felt_from(model, lump, limits, stop));
     let pressure_pa = found.map_err(|refusal| Refusal { place: place(), ..refusal })?;

@@ -22,6 +22,8 @@ pub struct MeasureRecorder {
     continuous: Option<Script>,
     newest: u64,
     rows: Vec<ToolRow>,
+    /// Memory for the rows that are being collected.
+    collected: Vec<ToolRow>,
 }
 
 impl MeasureRecorder {
@@ -35,7 +37,13 @@ impl MeasureRecorder {
         let seen_along = options.seen_along;
         let rate_hz = model.scene.stepping.rate_hz;
         let measures = Measures::new(rate_hz, begin_step, options, surface_m(model.shape(), seen_along).into_iter());
-        Ok(MeasureRecorder { measures, continuous: continuous.cloned(), newest: begin_step, rows: Vec::new() })
+        Ok(MeasureRecorder {
+            measures,
+            continuous: continuous.cloned(),
+            newest: begin_step,
+            rows: Vec::new(),
+            collected: Vec::new(),
+        })
     }
 
     /// Returns a recorder of the same tissue that begins at step `begin_step`. This one must have seen nothing.
@@ -48,17 +56,34 @@ impl MeasureRecorder {
     /// step that it has seen already has no effect, except the first one, at which tools may begin.
     pub fn see(&mut self, session: &Session) {
         let step = session.step_count();
-        if step == self.newest && self.measures.steps() == 0 {
-            self.collect(session);
-            self.measures.begin(&self.rows);
+        if self.is_new(step) {
+            let mut rows = std::mem::take(&mut self.collected);
+            self.collect(session, &mut rows);
+            self.see_rows(step, &rows);
+            self.collected = rows;
         }
-        if step <= self.newest {
+    }
+
+    /// Takes the rows of a step that another recorder of the session has collected ([`MeasureRecorder::rows`]), as
+    /// [`MeasureRecorder::see`] takes the session.
+    pub(crate) fn see_rows(&mut self, step: u64, rows: &[ToolRow]) {
+        if !self.is_new(step) {
             return;
         }
         (self.newest + 1..step).for_each(|_| self.measures.step(&self.rows));
-        self.collect(session);
-        self.measures.step(&self.rows);
+        self.rows.clear();
+        self.rows.extend_from_slice(rows);
+        if step == self.newest {
+            self.measures.begin(&self.rows);
+        } else {
+            self.measures.step(&self.rows);
+        }
         self.newest = step;
+    }
+
+    /// Returns whether the rows of a step are wanted: of a new one, and of the first while no other was seen.
+    fn is_new(&self, step: u64) -> bool {
+        step > self.newest || step == self.newest && self.measures.steps() == 0
     }
 
     /// Returns the rows of the tools at the newest step.
@@ -76,8 +101,8 @@ impl MeasureRecorder {
         self.measures
     }
 
-    fn collect(&mut self, session: &Session) {
-        self.rows.clear();
+    fn collect(&self, session: &Session, rows: &mut Vec<ToolRow>) {
+        rows.clear();
         // It reads the springs near a tool: only for who asks for it.
         let is_measured = self.measures.options().limits.strain.is_some();
         let edge_m = session.model().shape().edge_m();
@@ -91,11 +116,11 @@ impl MeasureRecorder {
             for (tool, profile) in script.forces.iter().enumerate() {
                 let poke = profile.at(now, script.rate_hz);
                 if poke.force_n != DVec3::ZERO {
-                    self.rows.push(row_of_push(session, tool, &poke, &near));
+                    rows.push(row_of_push(session, tool, &poke, &near));
                 }
             }
             for (index, profile) in script.moves.iter().enumerate() {
-                self.rows.push(row_of_point(session, script.forces.len() + index, profile.point, &near));
+                rows.push(row_of_point(session, script.forces.len() + index, profile.point, &near));
             }
         }
         let of = |(number, tool): (usize, &Tool)| match session.tissue().tool_contact(number) {
@@ -110,10 +135,10 @@ impl MeasureRecorder {
                 })
             }
         };
-        self.rows.extend(session.tools.iter().enumerate().filter_map(of));
+        rows.extend(session.tools.iter().enumerate().filter_map(of));
         // A tool that was played as a function of time may have got a command later.
-        self.rows.sort_by_key(|row| row.tool);
-        self.rows.dedup_by_key(|row| row.tool);
+        rows.sort_by_key(|row| row.tool);
+        rows.dedup_by_key(|row| row.tool);
     }
 }
 

@@ -108,7 +108,7 @@ impl MeasuredRun {
         self.recorder.see(session);
         if let Some(judge) = &mut self.judge {
             judge.see(session, self.recorder.rows());
-            let is_done = self.phases.as_mut().is_some_and(|phases| phases.see(session));
+            let is_done = self.phases.as_mut().is_some_and(|phases| phases.see(session, self.recorder.rows()));
             if is_done || judge.is_time_up(session) || self.ends_at.is_some_and(|step| session.step_count() >= step) {
                 self.ended = Some(self.moment(session));
             }
@@ -176,7 +176,9 @@ impl MeasuredMoment {
         let mut score = None;
         if let Some((judge, truth)) = &self.judged {
             figures.extend(truth.figures(self.rate_hz, judge.tasks()));
-            score = judge.score(&figures, &phases);
+            let of_phases: Vec<_> =
+                self.phases.iter().map(|phase| (&phase.figures().figures[..], phase.has_acted())).collect();
+            score = judge.score(&figures, &of_phases);
         }
         MomentFigures { step: self.step, figures, phases, score }
     }

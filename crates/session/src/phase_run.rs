@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use crate::Session;
 use crate::exercise_judge::{ExerciseJudge, PhaseFigures, limit_step};
 use crate::measure_recorder::MeasureRecorder;
-use palpate_exercise::{ExerciseTruth, Measures};
+use palpate_exercise::{ExerciseTruth, Measures, ToolRow};
 
 /// The end of a phase before its time, because the trainee went on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,7 +30,8 @@ pub(crate) struct PhaseRun {
 /// What was measured in a phase. Its figures are computed once, at the first use.
 #[derive(Debug)]
 pub(crate) struct PhaseMoment {
-    steps: [u64; 2],
+    begin_step: u64,
+    end_step: u64,
     measures: Measures,
     judge: ExerciseJudge,
     truth: ExerciseTruth,
@@ -65,10 +66,10 @@ impl PhaseRun {
         limit_s.map(|limit_s| limit_step(self.judge.begin_step(), limit_s, self.judge.rate_hz()))
     }
 
-    /// Takes the session at its present step. Returns whether the last phase has ended.
-    pub(crate) fn see(&mut self, session: &Session) -> bool {
+    /// Takes the session at its present step, with the rows of its tools. Returns whether the last phase has ended.
+    pub(crate) fn see(&mut self, session: &Session, rows: &[ToolRow]) -> bool {
         let step = session.step_count();
-        self.recorder.see(session);
+        self.recorder.see_rows(step, rows);
         self.judge.see(session, self.recorder.rows());
         loop {
             let is_up = self.limit_step().is_some_and(|limit| step >= limit);
@@ -93,13 +94,15 @@ impl PhaseRun {
     fn go_on(&mut self, session: &Session) {
         self.ended.push(Arc::new(self.present(session)));
         self.judge = self.judge.of_phase(session);
-        self.recorder = self.blank.beginning_at(session.step_count());
-        self.recorder.see(session);
+        let next = self.blank.beginning_at(session.step_count());
+        let ended = std::mem::replace(&mut self.recorder, next);
+        self.recorder.see_rows(session.step_count(), ended.rows());
     }
 
     fn present(&self, session: &Session) -> PhaseMoment {
         PhaseMoment {
-            steps: [self.judge.begin_step(), session.step_count()],
+            begin_step: self.judge.begin_step(),
+            end_step: session.step_count(),
             measures: self.recorder.measures().clone(),
             judge: self.judge.clone(),
             truth: self.judge.truth(session),
@@ -119,7 +122,12 @@ impl PhaseMoment {
         self.figures.get_or_init(|| {
             let mut figures = self.measures.figures();
             figures.extend(self.truth.figures(self.judge.rate_hz(), self.judge.tasks()));
-            PhaseFigures { steps: self.steps, figures, has_acted: self.judge.has_acted() }
+            PhaseFigures { begin_step: self.begin_step, end_step: self.end_step, figures }
         })
+    }
+
+    /// Returns whether the trainee has done anything in the phase.
+    pub(crate) fn has_acted(&self) -> bool {
+        self.judge.has_acted()
     }
 }

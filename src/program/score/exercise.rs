@@ -216,13 +216,11 @@ impl ScoredExercise {
     pub(crate) fn of(judge: &ExerciseJudge, seed: u64, session: &Session, ended: &MomentFigures) -> Self {
         let score = ended.score.as_ref();
         let phase =
-            |(phase, PhaseFigures { steps: [begin_step, end_step], figures, .. }): (&ExercisePhase, &PhaseFigures)| {
-                ScoredPhase {
-                    title: phase.title.clone(),
-                    begin_step: *begin_step,
-                    steps: end_step - begin_step,
-                    measures: figures.iter().map(ScoredMeasure::of).collect(),
-                }
+            |(phase, PhaseFigures { begin_step, end_step, figures }): (&ExercisePhase, &PhaseFigures)| ScoredPhase {
+                title: phase.title.clone(),
+                begin_step: *begin_step,
+                steps: end_step - begin_step,
+                measures: figures.iter().map(ScoredMeasure::of).collect(),
             };
         let criterion = |EarnedCriterion { criterion, value, part }: &EarnedCriterion| ScoredCriterion {
             measure: criterion.measure.clone(),

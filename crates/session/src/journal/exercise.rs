@@ -75,8 +75,8 @@ pub(super) fn result(end: &EndedExercise) -> pb::ExerciseResult {
         mark: Some(pb::Mark { place_m: vector(answer.mark.place_m), diameter_m: answer.mark.diameter_m }),
     };
     let phase = |phase: &PhaseFigures| pb::PhaseResult {
-        begin_step: phase.steps[0],
-        step: phase.steps[1],
+        begin_step: phase.begin_step,
+        step: phase.end_step,
         figures: recorded_figures(&phase.figures),
     };
     pb::ExerciseResult {
@@ -98,9 +98,9 @@ pub fn from_result(result: &pb::ExerciseResult, chosen: &ChosenExercise) -> Ende
         part: earned.earned,
     });
     let phase = |phase: &pb::PhaseResult| PhaseFigures {
-        steps: [phase.begin_step, phase.step],
+        begin_step: phase.begin_step,
+        end_step: phase.step,
         figures: known_figures(&phase.figures),
-        has_acted: true,
     };
     let answer = |answer: &pb::GivenAnswer| {
         let mark = answer.mark.as_ref()?;
