@@ -309,6 +309,67 @@ fn who_does_what_an_exercise_asks_earns_it_and_who_does_not_earns_little() {
     }
 }
 
+#[test]
+fn a_script_ends_a_phase_before_its_time_and_what_cannot_be_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let exercise = "name = \"two\"\ninstructions = \"Press, then rest.\"\nscenes = [\"liver\"]\n\
+                    [[phase]]\ntitle = \"Press\"\ninstructions = \"Press.\"\ntime_limit_s = 0.09\n\
+                    [[phase]]\ntitle = \"Rest\"\ninstructions = \"Rest.\"\n\
+                    [[criterion]]\nmeasure = \"press_count\"\nphase = 1\npoor = 0\ngood = 1\n";
+    std::fs::write(folder.path().join("two.toml"), exercise).unwrap();
+    let run = |ends: &str| {
+        let script = format!(
+            "duration_s = 0.1\nsample_every_s = 0.1\n[[tool]]\ntip = {{}}\n\
+             poses = [{{ at_s = 0.0, place_m = [0.03, 0.03, -0.004] }}]\n{ends}"
+        );
+        std::fs::write(folder.path().join("script.toml"), script).unwrap();
+        let run = [
+            "run",
+            "liver",
+            "script.toml",
+            "--quiet",
+            "--output",
+            "r.jsonl",
+            "--exercise",
+            "two.toml",
+            "--score",
+            "s.json",
+        ];
+        palpate(folder.path(), &run)
+    };
+    let scored = || -> serde_json::Value {
+        serde_json::from_str(&std::fs::read_to_string(folder.path().join("s.json")).unwrap()).unwrap()
+    };
+    let phases = |score: &serde_json::Value| -> Vec<(u64, u64)> {
+        let phases = score["exercise"]["phases"].as_array().unwrap().iter();
+        phases.map(|phase| (phase["begin_step"].as_u64().unwrap(), phase["steps"].as_u64().unwrap())).collect()
+    };
+    let end = |at_s: f64, phase: u32| format!("[[phase_end]]\nat_s = {at_s}\nphase = {phase}\n");
+    says(run(""), 0, &[]);
+    assert_eq!(phases(&scored()), [(0, 90), (90, 10)]);
+    says(run(&end(0.04, 1)), 0, &[]);
+    let first = scored();
+    assert_eq!(phases(&first), [(0, 40), (40, 60)]);
+    // The same bits again; and the last phase ends the exercise.
+    says(run(&end(0.04, 1)), 0, &[]);
+    assert_eq!(scored(), first);
+    says(run(&(end(0.04, 1) + &end(0.06, 2))), 0, &[]);
+    assert_eq!(phases(&scored()), [(0, 40), (40, 20)]);
+    // Too late: the phase has ended by its time.
+    says(run(&end(0.095, 1)), 0, &[]);
+    assert_eq!(phases(&scored()), [(0, 90), (90, 10)]);
+    for (ends, part) in [
+        (end(0.04, 3), "phase_end[0].phase: 3: the exercise `two` has 2 phases"),
+        (end(0.04, 0), "phase_end[0].phase: 0: must be from 1 to 8"),
+        (end(0.04, 9), "phase_end[0].phase: 9: must be from 1 to 8"),
+        (end(0.1, 1), "phase_end[0].at_s: must be before the script ends"),
+        (end(0.04, 2) + &end(0.05, 1), "phase_end[1].phase: must be above that of the end before"),
+        ("[[phase_end]]\nat_s = 0.04\n".to_owned(), "phase_end[0]"),
+    ] {
+        says(run(&ends), 2, &[part]);
+    }
+}
+
 /// A table of a press on a sheet, as the product simulates it.
 fn measured(sets: &[&str]) -> String {
     use palpate_session::press::ImposedPress;

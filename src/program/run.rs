@@ -5,11 +5,14 @@ use std::path::PathBuf;
 
 use palpate_realtime::clock::now_ns;
 use palpate_session::Session;
+use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::journal::exercise::ExerciseEvents;
+use palpate_session::phase_run::PhaseEnd;
 use palpate_session::run::{RunEvent, RunOptions, run_observed, write_event};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, StageTime, Summary, TopologyRecord};
+use palpate_tissue::scene::script::Script;
 
 use super::indent::{self, IndentArguments};
 use super::scene::SceneArguments;
@@ -58,6 +61,21 @@ pub(crate) struct RunArguments {
     quiet: bool,
 }
 
+/// Returns where the trainee of a script ends phases of an exercise.
+///
+/// # Errors
+/// Refuses a phase that the exercise does not have.
+fn phase_ends(script: &Script, chosen: Option<&ChosenExercise>) -> Result<Vec<PhaseEnd>, Failure> {
+    let Some(chosen) = chosen else { return Ok(Vec::new()) };
+    let phases = chosen.exercise.phases.len();
+    if let Some((index, (_, phase))) = script.phase_ends.iter().enumerate().find(|(_, end)| end.1 as usize > phases) {
+        let message =
+            format!("phase_end[{index}].phase: {phase}: the exercise `{}` has {phases} phases", chosen.exercise.name);
+        return Err(Failure::Refused(message));
+    }
+    Ok(script.phase_ends.iter().map(|(step, phase)| PhaseEnd { phase: *phase, step: *step }).collect())
+}
+
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
@@ -87,7 +105,8 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let mut recorder = match &arguments.score {
         Some(_) => {
             let continuous = (!arguments.held).then_some(&script);
-            Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), ExerciseEvents::default()))?)
+            let events = ExerciseEvents { phase_ends: phase_ends(&script, chosen.as_ref())?, result: None };
+            Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), events))?)
         }
         None => None,
     };

@@ -72,6 +72,9 @@ pub struct Script {
     /// Marks, each with the step at whose beginning it is made, in the order of the text. The tool that lays threads and clips makes
     /// them.
     pub marks: Vec<(u64, PlaceMark)>,
+    /// When the trainee ends phases of an exercise before their time: number of steps done, and the phase, from 1; both ascend. Only who
+    /// judges the run by an exercise heeds them.
+    pub phase_ends: Vec<(u64, u32)>,
     /// Changes of the tissue, each with the step at whose beginning it takes effect, by strictly ascending
     /// step.
     pub changes: Vec<(u64, Change)>,

@@ -12,6 +12,7 @@ use palpate_haptics::port::{DEFAULT_HANDLE_M, HANDLE_M};
 use palpate_haptics::{Coupling, Instrument, InstrumentPart, InstrumentPose, InstrumentTip, Port, Tip, TipShape};
 
 use super::action::{MAX_MARKS, PlaceMark};
+use super::exercise::MAX_PHASES;
 use super::kind::TextKind;
 use super::profile::{
     CentreProfile, InstrumentProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile,
@@ -131,6 +132,7 @@ impl Binding<'_> {
         }
         let ties = self.ties(fields)?;
         let marks = self.marks(fields, steps)?;
+        let phase_ends = self.phase_ends(fields, steps)?;
         control_points.extend(moves.iter().map(|profile| profile.point));
         // A row of tips would make many.
         let of_tools = poses.iter().filter(|profile: &&PoseProfile| profile.mounted.is_none());
@@ -171,6 +173,7 @@ impl Binding<'_> {
             instruments,
             ties,
             marks,
+            phase_ends,
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
@@ -611,17 +614,45 @@ impl Binding<'_> {
         Ok(ties)
     }
 
+    /// Reads `at_s`, a time before the script ends, as a step.
+    fn step_within(&mut self, fields: &mut Fields<'_>, steps: u64) -> Result<u64> {
+        let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
+        let step = self.steps(&fields.path("at_s"), at_s)?;
+        if step >= steps {
+            return Err(fields.refuse(Reason::OutOfRange, "at_s", "must be before the script ends (duration_s)"));
+        }
+        Ok(step)
+    }
+
+    /// Reads when a trainee ends phases of an exercise.
+    fn phase_ends(&mut self, fields: &mut Fields<'_>, steps: u64) -> Result<Vec<(u64, u32)>> {
+        let mut ends: Vec<(u64, u32)> = Vec::new();
+        for item in items(fields, "phase_end")? {
+            let end = item.table(|fields| {
+                let step = self.step_within(fields, steps)?;
+                let phase = fields.required("phase")?.whole()?;
+                let known = u32::try_from(phase).ok().filter(|phase| (1..=MAX_PHASES).contains(&(*phase as usize)));
+                let Some(phase) = known else {
+                    let message = format!("{phase}: must be from 1 to {MAX_PHASES}");
+                    return Err(fields.refuse(Reason::OutOfRange, "phase", message));
+                };
+                if ends.last().is_some_and(|last| last.1 >= phase || last.0 > step) {
+                    let message = "must be above that of the end before, and its time not earlier";
+                    return Err(fields.refuse(Reason::OutOfRange, "phase", message));
+                }
+                Ok((step, phase))
+            })?;
+            ends.push(end);
+        }
+        Ok(ends)
+    }
+
     /// Reads the marks that a trainee makes.
     fn marks(&mut self, fields: &mut Fields<'_>, steps: u64) -> Result<Vec<(u64, PlaceMark)>> {
         let mut marks = Vec::new();
         for item in items(fields, "mark")? {
             marks.push(item.table(|fields| {
-                let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
-                let step = self.steps(&fields.path("at_s"), at_s)?;
-                if step >= steps {
-                    let message = "must be before the script ends (duration_s)";
-                    return Err(fields.refuse(Reason::OutOfRange, "at_s", message));
-                }
+                let step = self.step_within(fields, steps)?;
                 let place_m = fields.required("place_m")?.place_in(self.scene.shape().dimensions())?;
                 let mark = PlaceMark { place_m, diameter_m: fields.number("diameter_m")? };
                 check_mark(fields.own_path(), self.scene.shape(), &mark)?;
