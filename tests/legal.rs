@@ -48,6 +48,7 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         body: Body::Sheet(Sheet { points, spacing_m: any(&mut random), point_mass_kg: any(&mut random), fixed }),
         material: None,
         inclusions: Arc::default(),
+        added_lumps: Arc::default(),
         springs: Springs {
             stiffness_n_per_m,
             shear_stiffness_n_per_m,

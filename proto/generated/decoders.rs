@@ -21,6 +21,7 @@
 ("GetTextureRequest", |bytes| <GetTextureRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetTopologyRequest", |bytes| <GetTopologyRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("GetWoundRequest", |bytes| <GetWoundRequest as ::prost::Message>::decode(bytes).is_ok()),
+("HideLumpRequest", |bytes| <HideLumpRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListCallersRequest", |bytes| <ListCallersRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListExercisesRequest", |bytes| <ListExercisesRequest as ::prost::Message>::decode(bytes).is_ok()),
 ("ListFleetSessionsRequest", |bytes| <ListFleetSessionsRequest as ::prost::Message>::decode(bytes).is_ok()),

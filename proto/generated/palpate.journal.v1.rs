@@ -356,6 +356,9 @@ pub struct Tissue {
     pub corrected_integrator: ::prost::alloc::string::String,
     #[prost(uint32, tag = "11")]
     pub corrected_substeps: u32,
+    /// The lumps that the trainer of an exercise had hidden in the tissue while the session ran, beside what the header's scene has.
+    #[prost(message, repeated, tag = "14")]
+    pub added_lumps: ::prost::alloc::vec::Vec<Lump>,
 }
 impl ::prost::Name for Tissue {
     const NAME: &'static str = "Tissue";
@@ -365,6 +368,27 @@ impl ::prost::Name for Tissue {
     }
     fn type_url() -> ::prost::alloc::string::String {
         "/palpate.journal.v1.Tissue".into()
+    }
+}
+/// A lump in the tissue.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Lump {
+    #[prost(message, optional, tag = "1")]
+    pub centre_m: ::core::option::Option<crate::pb::Vector3>,
+    #[prost(double, tag = "2")]
+    pub radius_m: f64,
+    /// Stiffness inside over that outside.
+    #[prost(double, tag = "3")]
+    pub stiffness_factor: f64,
+}
+impl ::prost::Name for Lump {
+    const NAME: &'static str = "Lump";
+    const PACKAGE: &'static str = "palpate.journal.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.journal.v1.Lump".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.journal.v1.Lump".into()
     }
 }
 /// The session starts to run.
@@ -482,6 +506,9 @@ pub struct ExerciseResult {
     /// The phases that had begun; empty for an exercise of one piece.
     #[prost(message, repeated, tag = "7")]
     pub phases: ::prost::alloc::vec::Vec<PhaseResult>,
+    /// The lumps that the trainer had hidden while it went on.
+    #[prost(message, repeated, tag = "8")]
+    pub added_lumps: ::prost::alloc::vec::Vec<Lump>,
 }
 impl ::prost::Name for ExerciseResult {
     const NAME: &'static str = "ExerciseResult";

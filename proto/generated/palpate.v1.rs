@@ -687,6 +687,43 @@ impl ::prost::Name for AdviseTraineeResponse {
         "/palpate.v1.AdviseTraineeResponse".into()
     }
 }
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct HideLumpRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// Absent: drawn as the exercise draws its lumps, apart from the others.
+    #[prost(message, optional, tag = "2")]
+    pub lump: ::core::option::Option<HiddenLump>,
+}
+impl ::prost::Name for HideLumpRequest {
+    const NAME: &'static str = "HideLumpRequest";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.HideLumpRequest".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.HideLumpRequest".into()
+    }
+}
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct HideLumpResponse {
+    /// As hidden.
+    #[prost(message, optional, tag = "1")]
+    pub lump: ::core::option::Option<HiddenLump>,
+    /// The step from which on it is there.
+    #[prost(uint64, tag = "2")]
+    pub step: u64,
+}
+impl ::prost::Name for HideLumpResponse {
+    const NAME: &'static str = "HideLumpResponse";
+    const PACKAGE: &'static str = "palpate.v1";
+    fn full_name() -> ::prost::alloc::string::String {
+        "palpate.v1.HideLumpResponse".into()
+    }
+    fn type_url() -> ::prost::alloc::string::String {
+        "/palpate.v1.HideLumpResponse".into()
+    }
+}
 /// Who a caller is in a session that is made for an exercise.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -902,6 +939,33 @@ pub mod exercise_service_client {
                 .insert(GrpcMethod::new("palpate.v1.ExerciseService", "AdviseTrainee"));
             self.inner.unary(req, path, codec).await
         }
+        /// Hides another lump in the tissue while the exercise goes on: from the step in the answer on, it is felt and judged as the others.
+        /// For trainers. Refused: an exercise that hides no lumps (NOT_AVAILABLE) or has ended (OUT_OF_TURN), a box without room for another
+        /// one (OUT_OF_RANGE), and more than 64 lumps (TOO_MANY).
+        pub async fn hide_lump(
+            &mut self,
+            request: impl tonic::IntoRequest<super::HideLumpRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::HideLumpResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::BoundedCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/palpate.v1.ExerciseService/HideLump",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("palpate.v1.ExerciseService", "HideLump"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -955,6 +1019,16 @@ pub mod exercise_service_server {
             request: tonic::Request<super::AdviseTraineeRequest>,
         ) -> std::result::Result<
             tonic::Response<super::AdviseTraineeResponse>,
+            tonic::Status,
+        >;
+        /// Hides another lump in the tissue while the exercise goes on: from the step in the answer on, it is felt and judged as the others.
+        /// For trainers. Refused: an exercise that hides no lumps (NOT_AVAILABLE) or has ended (OUT_OF_TURN), a box without room for another
+        /// one (OUT_OF_RANGE), and more than 64 lumps (TOO_MANY).
+        async fn hide_lump(
+            &self,
+            request: tonic::Request<super::HideLumpRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::HideLumpResponse>,
             tonic::Status,
         >;
     }
@@ -1205,6 +1279,51 @@ pub mod exercise_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = AdviseTraineeSvc(inner);
+                        let codec = crate::codec::BoundedCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/palpate.v1.ExerciseService/HideLump" => {
+                    #[allow(non_camel_case_types)]
+                    struct HideLumpSvc<T: ExerciseService>(pub Arc<T>);
+                    impl<
+                        T: ExerciseService,
+                    > tonic::server::UnaryService<super::HideLumpRequest>
+                    for HideLumpSvc<T> {
+                        type Response = super::HideLumpResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::HideLumpRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ExerciseService>::hide_lump(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = HideLumpSvc(inner);
                         let codec = crate::codec::BoundedCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

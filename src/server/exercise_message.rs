@@ -105,6 +105,11 @@ pub(super) fn moment(live: &LiveExercise, moment: &MomentFigures, is_trainee: bo
     }
 }
 
+/// Returns a lump that is hidden.
+pub(super) fn lump(lump: &Lump) -> pb::HiddenLump {
+    pb::HiddenLump { centre_m: vector(lump.centre_m), radius_m: lump.radius_m, stiffness_factor: lump.stiffness_factor }
+}
+
 /// Returns the result of an exercise.
 pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: bool) -> pb::ExerciseResult {
     let MomentFigures { step, figures: all, phases, score } = &ended.figures;
@@ -120,11 +125,6 @@ pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: boo
         value: earned.value,
         earned: earned.part,
         phase: earned.criterion.phase.unwrap_or(0),
-    };
-    let lump = |lump: &Lump| pb::HiddenLump {
-        centre_m: vector(lump.centre_m),
-        radius_m: lump.radius_m,
-        stiffness_factor: lump.stiffness_factor,
     };
     let answer = |answer: &RecordedMark| pb::GivenAnswer {
         step: answer.step,
@@ -143,7 +143,7 @@ pub(super) fn result(live: &LiveExercise, ended: &EndedExercise, is_trainee: boo
         figures: figures(all.iter()),
         score_percent: score.as_ref().map(|score| score.percent),
         criteria: score.iter().flat_map(|score| score.criteria.iter().map(criterion)).collect(),
-        lumps: live.chosen.lumps.iter().map(lump).collect(),
+        lumps: live.chosen.lumps.iter().chain(&ended.added_lumps).map(lump).collect(),
         answers: ended.answers.iter().map(answer).collect(),
         phases: phases.iter().map(phase).collect(),
         ..brief

@@ -5,15 +5,17 @@ use std::pin::Pin;
 use std::sync::Arc;
 
 use futures_util::stream::{self, Stream};
+use glam::DVec3;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use palpate_proto::pb::exercise_service_server::ExerciseService;
 use palpate_realtime::{ExerciseNews, LiveExercise, StreamGuard, StreamKind};
 use palpate_refusal::printable::printable;
-use palpate_refusal::{Reason, Refusal};
+use palpate_refusal::{Reason, Refusal, finite_vector};
 use palpate_session::budget::Account;
 use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::exercise::{Lump, MAX_PARTS};
 use palpate_tissue::scene::{Body, Scene};
 use tokio::sync::watch;
 use tonic::{Request, Response, Status};
@@ -185,6 +187,71 @@ impl ExerciseService for Exercises {
         info!(session = %handle.id, number = told.number, "trainee advised");
         Ok(Response::new(pb::AdviseTraineeResponse { advice: Some(advice(&told)) }))
     }
+
+    async fn hide_lump(&self, request: Request<pb::HideLumpRequest>) -> Result<Response<pb::HideLumpResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let pb::HideLumpRequest { session_id, lump } = request.into_inner();
+        let handle = self.0.session(&session_id).await?;
+        let (chosen, seed) = (another_lump(handle.live_exercise()?, lump.as_ref())?, random_bits()? as u64);
+        let (pacer, to_change) = (self.0.pacer.clone(), handle.clone());
+        let hide = move |cancel: &CancelFlag| {
+            let exercise = to_change.live_exercise()?;
+            let lump = |added: &[Lump]| match chosen {
+                _ if exercise.chosen.lumps.len() + added.len() >= MAX_PARTS => {
+                    let message = format!("has {MAX_PARTS} lumps already");
+                    Err(Refusal::new(Reason::TooMany, "session_id", message))
+                }
+                Some(lump) => Ok(lump),
+                None => drawn_lump(exercise, added, seed),
+            };
+            pacer.add_lump(&to_change, lump, cancel.flag())
+        };
+        let (step, model) = self.0.job_pool.work(&account, hide).await??;
+        info!(session = %handle.id, step, "lump hidden");
+        let lump = model.scene.added_lumps.last().map(exercise_message::lump);
+        Ok(Response::new(pb::HideLumpResponse { lump, step }))
+    }
+}
+
+/// Reads the lump that a trainer chooses to hide; `None`: it is drawn.
+///
+/// # Errors
+/// Refuses an exercise that hides no lumps ([`Reason::NotAvailable`]), one that has ended ([`Reason::OutOfTurn`]), and a lump without a
+/// place.
+fn another_lump(live: &LiveExercise, lump: Option<&pb::HiddenLump>) -> Result<Option<Lump>, Refusal> {
+    if live.chosen.exercise.lumps.as_ref().is_none_or(|hidden| hidden.count[1] == 0) {
+        let message = "is a session whose exercise hides no lumps";
+        return Err(Refusal::new(Reason::NotAvailable, "session_id", message));
+    }
+    if live.has_ended() {
+        return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is a session whose exercise has ended"));
+    }
+    let read = |lump: &pb::HiddenLump| {
+        let centre_m =
+            lump.centre_m.as_ref().ok_or_else(|| Refusal::new(Reason::Missing, "lump.centre_m", "is missing"))?;
+        Ok(Lump {
+            centre_m: finite_vector("lump.centre_m", from_vector(Some(centre_m)))? + DVec3::ZERO,
+            radius_m: lump.radius_m,
+            stiffness_factor: lump.stiffness_factor,
+        })
+    };
+    lump.map(read).transpose()
+}
+
+/// Draws another lump for an exercise, in which a trainer has hidden `added` already.
+///
+/// # Errors
+/// Refuses a box without room for another one.
+fn drawn_lump(live: &LiveExercise, added: &[Lump], seed: u64) -> Result<Lump, Refusal> {
+    let ChosenExercise { exercise, lumps, .. } = &live.chosen;
+    let others: Vec<Lump> = lumps.iter().chain(added).copied().collect();
+    exercise.lumps.as_ref().and_then(|hidden| hidden.another(seed, &others)).ok_or_else(|| {
+        Refusal::new(
+            Reason::OutOfRange,
+            "lump",
+            "can't be drawn: the exercise's box has no room for another one; give its place",
+        )
+    })
 }
 
 /// Refuses exercises on a server of a fleet, where the trainee's ID would lead to no server.

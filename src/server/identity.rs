@@ -91,6 +91,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.AdminService/ReviveSession", Access::Role(Role::Administer)),
     ("/palpate.v1.ExerciseService/AdviseTrainee", Access::Role(Role::Create)),
     ("/palpate.v1.ExerciseService/FinishExercise", Access::Role(Role::Touch)),
+    ("/palpate.v1.ExerciseService/HideLump", Access::Role(Role::Create)),
     ("/palpate.v1.ExerciseService/ListExercises", Access::Role(Role::Watch)),
     ("/palpate.v1.ExerciseService/WatchExercise", Access::Role(Role::Watch)),
     ("/palpate.v1.HapticService/AcquireTool", Access::Role(Role::Touch)),

@@ -306,7 +306,7 @@ impl SessionService for Sessions {
         let handle = self.0.session(&request.session_id).await?;
         if handle.exercise.is_some() {
             // What a trainee is told of the tissue is that of the beginning.
-            let message = "is made for an exercise, whose tissue stays as it is";
+            let message = "is made for an exercise, whose coefficients stay as they are; HideLump adds a lump";
             return Err(Refusal::new(Reason::WrongKind, "session_id", message).into());
         }
         let (change, to_change, pacer) = (wire::scene::from_change(&request), handle.clone(), self.0.pacer.clone());

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use palpate_proto::pb;
 use pb::create_session_request::Source;
+use pb::exercise_service_client::ExerciseServiceClient;
 use pb::touch_request::Message as Say;
 use prost::Message;
 use tokio::sync::mpsc;
@@ -172,6 +173,10 @@ impl Trainee<'_> {
     }
 }
 
+async fn exercises(server: &TestServer) -> ExerciseServiceClient<Channel> {
+    ExerciseServiceClient::new(server.channel().await)
+}
+
 /// A message without what differs between any two sessions: IDs, times of clocks, processor time and memory.
 fn without_ids(path: &str, message: &[u8], ids: &[&str]) -> Vec<u8> {
     let mut message = message.to_vec();
@@ -239,12 +244,21 @@ async fn what_a_trainee_receives_is_equal_for_two_truths_before_the_first_touch_
         let server = TestServer::start_patiently(folder.path(), "", "");
         let source = Some(pb::chosen_exercise::Source::Name("lumps-1".to_owned()));
         let chosen = pb::ChosenExercise { source, seed: Some(seed), scene_name: String::new() };
-        let session = server.create(Source::Exercise(chosen), true).await.unwrap();
+        let mut session = server.create(Source::Exercise(chosen), true).await.unwrap();
         let id = session.exercise.as_ref().unwrap().trainee_id.clone();
         let mut trainee = Trainee { server: &server, id: id.clone(), received: Received::new() };
         trainee.ask_everything().await;
         let (send, mut inbound) = trainee.touch().await;
         let before: Received = trainee.received.clone();
+        // Its trainer hides another lump.
+        let another = pb::HideLumpRequest { session_id: session.session_id.clone(), lump: None };
+        let another = exercises(&server).await.hide_lump(another).await.unwrap().into_inner().lump.unwrap();
+        session.scene.as_mut().unwrap().inclusions.push(pb::Inclusion {
+            centre_m: another.centre_m,
+            radius_m: Some(another.radius_m),
+            stiffness_factor: Some(another.stiffness_factor),
+            ..Default::default()
+        });
         // It touches: what it feels depends on the truth, and does not tell it.
         server.start_until(&id, 700).await;
         for number in 0..40_u32 {

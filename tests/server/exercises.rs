@@ -88,6 +88,15 @@ async fn end(server: &TestServer, session_id: &str, phase: u32) -> Result<Option
     exercises(server).await.finish_exercise(request).await.map(|finished| finished.into_inner().result)
 }
 
+async fn hide(
+    server: &TestServer,
+    session_id: &str,
+    lump: Option<pb::HiddenLump>,
+) -> Result<pb::HideLumpResponse, tonic::Status> {
+    let request = pb::HideLumpRequest { session_id: session_id.to_owned(), lump };
+    exercises(server).await.hide_lump(request).await.map(tonic::Response::into_inner)
+}
+
 /// The figures by name and tool, as bits.
 fn bits(figures: &[pb::Figure]) -> BTreeSet<(String, Option<u32>, u64)> {
     figures.iter().map(|figure| (figure.measure.clone(), figure.tool, figure.value.to_bits())).collect()
@@ -217,6 +226,7 @@ async fn a_trainee_gets_no_call_that_shows_the_truth_and_a_trainer_advises() {
             .advise_trainee(pb::AdviseTraineeRequest { session_id: id(), text: "a".into(), place_m: None })
             .await
             .err(),
+        hide(&server, &trainee_id, None).await.err(),
     ];
     for refused in refused {
         let (code, reason, field) = told(&refused.unwrap());
@@ -305,6 +315,61 @@ async fn an_exercise_of_a_client_is_read_and_what_is_wrong_is_named() {
     let paper = server.paper(false).await;
     let watched = exercises(&server).await.watch_exercise(pb::WatchExerciseRequest { session_id: paper }).await;
     assert_eq!(told(&watched.err().unwrap()).1, "UNKNOWN_EXERCISE");
+}
+
+#[tokio::test]
+async fn a_trainer_hides_another_lump_which_is_felt_and_judged_and_the_journal_has_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let journals = folder.path().join("journals");
+    let server = TestServer::start_patiently(folder.path(), &format!("journal = {journals:?}"), "");
+    let (session, trainee_id) = created(&server, Some(3)).await;
+    let session_id = session.session_id.clone();
+    let first: Vec<_> = session.scene.unwrap().inclusions.iter().map(|lump| lump.centre_m).collect();
+    let scene_of = async |id: &str| server.status(id).await.scene.unwrap();
+    let plain = scene_of(&trainee_id).await;
+    // One is drawn away from the others, and the second lies where the trainee will press.
+    let drawn = hide(&server, &session_id, None).await.unwrap().lump.unwrap();
+    assert!(!first.contains(&drawn.centre_m) && (0.008..=0.010).contains(&drawn.radius_m), "{drawn:?}");
+    let centre_m = Some(pb::Vector3 { x: 0.01, y: 0.0, z: 0.027 });
+    let under = pb::HiddenLump { centre_m, radius_m: 0.009, stiffness_factor: 6.0 };
+    let hidden = hide(&server, &session_id, Some(under)).await.unwrap();
+    assert_eq!(hidden.lump, Some(under));
+    press_and_mark(&server, &trainee_id).await;
+    let result = finish(&server, &trainee_id).await;
+    assert!(result.step > hidden.step);
+    let centres: Vec<_> = result.lumps.iter().map(|lump| lump.centre_m).collect();
+    assert_eq!(centres, [&first[..], &[drawn.centre_m, centre_m]].concat());
+    let value = |name: &str| result.figures.iter().find(|figure| figure.measure == name).unwrap().value;
+    assert_eq!((value("hits"), value("hits") + value("misses")), (1.0, centres.len() as f64));
+    // The trainer is shown all of them in the scene, the trainee none.
+    assert_eq!(scene_of(&session_id).await.inclusions.len(), centres.len());
+    assert_eq!(scene_of(&trainee_id).await, plain);
+    assert!(plain.inclusions.is_empty());
+    let without_centre = pb::HiddenLump { centre_m: None, ..under };
+    let task = server.create(phased(), true).await.unwrap();
+    for (id, reason, field) in
+        [(&session_id, "OUT_OF_TURN", "session_id"), (&task.session_id, "NOT_AVAILABLE", "session_id")]
+    {
+        let (_, told_reason, told_field) = told(&hide(&server, id, None).await.unwrap_err());
+        assert_eq!((told_reason.as_str(), told_field.as_str()), (reason, field));
+    }
+    let (other, _) = created(&server, Some(4)).await;
+    for (lump, reason, field) in [
+        (without_centre, "MISSING", "lump.centre_m"),
+        (pb::HiddenLump { stiffness_factor: 1e3, ..under }, "OUT_OF_RANGE", "lump"),
+        (pb::HiddenLump { centre_m: Some(pb::Vector3 { x: 3.0, y: 0.0, z: 0.0 }), ..under }, "OUT_OF_RANGE", "lump"),
+    ] {
+        let (_, told_reason, told_field) = told(&hide(&server, &other.session_id, Some(lump)).await.unwrap_err());
+        assert!(told_reason == reason && told_field.starts_with(field), "{told_reason} {told_field}");
+    }
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: session_id.clone() }).await.unwrap();
+    let journal = journals.join(format!("{session_id}.1.mcap"));
+    // The session is computed again with the same bits, and so are the figures that need the truth.
+    assert!(palpate(&["journal", "verify", journal.to_str().unwrap()]).status.success());
+    let found = score(&journal, &[]).unwrap();
+    assert_eq!(scored(&found), bits(&result.figures));
+    assert_eq!(found.1["exercise"]["lumps"].as_array().unwrap().len(), centres.len());
+    assert_eq!(found.1["exercise"]["score_percent"].as_f64(), result.score_percent);
 }
 
 /// Two phases: the first one goes on until the trainee ends it, the second one for 0.3 s.
@@ -421,8 +486,10 @@ async fn after_a_crash_a_session_has_its_exercise_its_ids_and_its_result() {
     let server = TestServer::start_patiently(folder.path(), &config, "");
     let (session, trainee_id) = created(&server, Some(3)).await;
     let session_id = session.session_id;
+    hide(&server, &session_id, None).await.unwrap();
     press_and_mark(&server, &trainee_id).await;
     let result = finish(&server, &session_id).await;
+    let scene = server.status(&session_id).await.scene;
     let until_durable = async {
         // The result is noted after its step.
         let reached = server.status(&session_id).await.step;
@@ -444,5 +511,7 @@ async fn after_a_crash_a_session_has_its_exercise_its_ids_and_its_result() {
     // With its time, what the criteria earned, and the answers.
     assert!(result.time_s > 0.0 && !result.criteria.is_empty() && result.answers.len() == 1, "{result:?}");
     assert_eq!(finish(&server, &session_id).await, result);
-    assert_eq!(server.status(&session_id).await.exercise.unwrap().seed, Some(3));
+    let status = server.status(&session_id).await;
+    // What the trainer had hidden is there again.
+    assert_eq!((status.exercise.unwrap().seed, status.scene), (Some(3), scene));
 }

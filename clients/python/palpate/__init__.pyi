@@ -267,6 +267,16 @@ class Session:
     def mark(self, tool: int, place_m: Vector, *, diameter_m: Optional[float] = None) -> None:
         """Marks a place of the surface, m, as an answer in an exercise: what you look for is there, or below it, and has about this
         diameter, m. It changes nothing, and the tool does what it did."""
+    def hide_lump(
+        self,
+        *,
+        centre_m: Optional[Vector] = None,
+        radius_m: Optional[float] = None,
+        stiffness_factor: Optional[float] = None,
+    ) -> dict[str, Any]:
+        """Hides another lump in the tissue while the exercise goes on: drawn as the exercise draws its lumps, or the given one
+        (`centre_m` and `radius_m`, m, and `stiffness_factor`, all three). Returns these of the lump, and the `step` from which on it is
+        there. For trainers."""
     def untie(self, tool: int, number: int) -> None:
         """Cuts a thread or clip, and takes it out."""
     @property

@@ -23,7 +23,7 @@ use tokio::sync::{Mutex, oneshot};
 use crate::arrays::vector;
 use crate::device::Given;
 use crate::error::{has_reason, of_client, of_status, refused, wrong};
-use crate::exercise::{self, KnownExercise, LiveMeasures, SessionTask, ToldResult};
+use crate::exercise::{self, KnownExercise, LiveMeasures, SessionTask, ToldHiddenLump, ToldResult};
 use crate::hand::Hand;
 use crate::instrument::Instrument;
 use crate::load::load;
@@ -691,6 +691,35 @@ impl RemoteSession {
         let request = pb::AdviseTraineeRequest { session_id, text: text.to_owned(), place_m };
         answer(py, self.awaited, async move {
             called!(session, ExerciseServiceClient.advise_trainee(request)).map(|_| NOTHING)
+        })
+    }
+
+    /// Hides another lump in the tissue while the exercise goes on: drawn as the exercise draws its lumps, or the given one
+    /// (`centre_m` and `radius_m`, m, and `stiffness_factor`, all three). Returns these of the lump, and the `step` from which on it is
+    /// there. For trainers.
+    #[pyo3(signature = (*, centre_m=None, radius_m=None, stiffness_factor=None))]
+    fn hide_lump<'py>(
+        &self,
+        py: Python<'py>,
+        centre_m: Option<&Bound<'py, PyAny>>,
+        radius_m: Option<f64>,
+        stiffness_factor: Option<f64>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (session, session_id) = self.own();
+        let centre_m = centre_m.map(|centre_m| vector("centre_m", centre_m)).transpose()?.map(numbers);
+        let lump = match (centre_m, radius_m, stiffness_factor) {
+            (None, None, None) => None,
+            (Some(centre_m), Some(radius_m), Some(stiffness_factor)) => {
+                Some(pb::HiddenLump { centre_m: Some(centre_m), radius_m, stiffness_factor })
+            }
+            _ => {
+                let message = "goes with radius_m and stiffness_factor: give all three, or none";
+                return Err(wrong("centre_m", message));
+            }
+        };
+        let request = pb::HideLumpRequest { session_id, lump };
+        answer(py, self.awaited, async move {
+            called!(session, ExerciseServiceClient.hide_lump(request)).map(ToldHiddenLump::of)
         })
     }
 

@@ -210,6 +210,27 @@ impl ToldResult {
     }
 }
 
+/// A lump that the trainer has hidden.
+#[derive(IntoPyObject)]
+pub(crate) struct ToldHiddenLump {
+    centre_m: Option<(f64, f64, f64)>,
+    radius_m: f64,
+    stiffness_factor: f64,
+    step: u64,
+}
+
+impl ToldHiddenLump {
+    pub(crate) fn of(hidden: pb::HideLumpResponse) -> Self {
+        let lump = hidden.lump.unwrap_or_default();
+        ToldHiddenLump {
+            centre_m: place(lump.centre_m),
+            radius_m: lump.radius_m,
+            stiffness_factor: lump.stiffness_factor,
+            step: hidden.step,
+        }
+    }
+}
+
 /// The figures of a moment.
 #[derive(IntoPyObject)]
 struct ToldMoment {

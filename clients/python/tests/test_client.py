@@ -10,6 +10,7 @@ import threading
 import time
 import unittest
 from pathlib import Path
+from unittest.mock import ANY
 
 import numpy as np
 
@@ -333,6 +334,11 @@ class Clients(Served, unittest.TestCase):
             with server.session(told["trainee_id"]):
                 pass  # A trainee leaves; the session stays.
             session.advise("press deeper", place_m=(0.01, 0.0, 0.04))
+            lump = {"centre_m": (-0.03, 0.03, 0.027), "radius_m": 0.008, "stiffness_factor": 6.0}
+            self.assertEqual({**lump, "step": ANY}, session.hide_lump(**lump))
+            with self.assertRaises(palpate.Refused) as raised:
+                session.hide_lump(radius_m=0.008)
+            self.assertEqual(raised.exception.field, "centre_m")
             live, seen = session.measures(), trainee.measures()
             self.assertEqual(next(seen)["advice"], [{"number": 1, "text": "press deeper", "place_m": (0.01, 0.0, 0.04)}])
             for height_mm in range(43, 34, -1):
@@ -344,7 +350,8 @@ class Clients(Served, unittest.TestCase):
             self.assertEqual((moments[-1]["result"], moments[-1]["figures"]), (result, result["figures"]))
             self.assertGreater(result["tools"][0]["peak_force_n"], 0.1)
             self.assertEqual((len(result["answers"]), result["answers"][0]["place_m"]), (1, (0.01, 0.0, 0.04)))
-            self.assertTrue(result["is_told"] and result["lumps"] and 0.0 <= result["score_percent"] <= 100.0)
+            self.assertEqual(result["lumps"][-1], lump)
+            self.assertTrue(result["is_told"] and 0.0 <= result["score_percent"] <= 100.0)
             self.assertNotIn("hits", list(seen)[-1]["figures"])
         with server.create_session("paper") as session:
             self.assertIsNone(session.exercise())

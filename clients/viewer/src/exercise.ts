@@ -319,8 +319,8 @@ export class ExercisePanel {
   /** Draws answers and markers on the tissue, and what was hidden once that is told. */
   private draw(): void {
     const { result } = this;
-    // A trainer sees the lumps of the scene.
-    if (result && this.isTrainee) this.stage.setLumps(hiddenIn(result));
+    // A trainer sees the lumps of the scene, and now also those that were hidden since.
+    if (result) this.stage.setLumps(hiddenIn(result));
     this.stage.setMarks([...(result?.isTold ? markedIn(result) : this.answers), ...this.markers]);
   }
 }

@@ -63,6 +63,7 @@ class Row {
   private readonly state = element("span", { className: "state", textContent: "Asking …" });
   private readonly score = element("b");
   private readonly figures = element("p", { className: "figures" });
+  private readonly another = element("button", { type: "button", textContent: "Another lump", hidden: true, title: "Hides one more in the tissue, which the trainee is not told" });
   private readonly hint = element("input", { type: "text", maxLength: 200, placeholder: "A hint for the trainee" });
 
   constructor(readonly trainee: Trainee) {
@@ -78,13 +79,14 @@ class Row {
     const link = element("a", { href: withSession(traineeId).replace("/trainer.html", "/"), target: "_blank", textContent: "The trainee's link" });
     const finish = element("button", { type: "button", textContent: "Finish" });
     finish.addEventListener("click", () => void this.finish());
+    this.another.addEventListener("click", () => void this.hideLump());
     const drop = element("button", { type: "button", textContent: "Remove", title: "Takes it off this list; the session goes on" });
     drop.addEventListener("click", () => remove(this));
     this.hint.setAttribute("aria-label", `A hint for ${excerpt(name)}`);
     const told = element("p");
     told.append(this.state, " ", this.score);
     const buttons = element("div", { className: "row" });
-    buttons.append(link, watch, finish, drop);
+    buttons.append(link, watch, this.another, finish, drop);
     this.item.append(heading, told, this.figures, send, buttons);
   }
 
@@ -95,6 +97,7 @@ class Row {
       const { session } = await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
       if (!session) return;
       this.isOver = session.exercise?.finished ?? false;
+      this.another.hidden = this.isOver || !(session.exercise?.exercise?.hidesTruth ?? false);
       if (session.state === SessionState.PAUSED && !this.isOver) return this.tell(session);
       const told = await exerciseNow(sessionId);
       if (told) this.tell(session, told);
@@ -126,6 +129,15 @@ class Row {
       say(`Sent to ${this.trainee.name}.`);
     } catch (error) {
       say(`Not sent: ${describe(error)}.`);
+    }
+  }
+
+  private async hideLump(): Promise<void> {
+    try {
+      const { lump } = await exercises.hideLump({ sessionId: this.trainee.sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+      say(`${this.trainee.name} has another lump${lump ? `, ${Math.round(2000 * lump.radiusM)} mm wide` : ""}.`);
+    } catch (error) {
+      say(`No lump was hidden: ${describe(error)}.`);
     }
   }
 

@@ -31,6 +31,7 @@ use palpate_session::schedule::Schedule;
 use palpate_session::surface::Skin;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
+use palpate_tissue::scene::exercise::Lump;
 use palpate_tissue::scene::{Change, Scene};
 use palpate_tissue::select::scheme_selection;
 use palpate_tissue::{Burns, Model};
@@ -451,6 +452,20 @@ impl Pacer {
         stop: &AtomicBool,
     ) -> Result<(u64, Arc<Model>)> {
         handle.change(change, at_step, |needed| self.check_share(self.taken_by_others(handle), needed), stop)
+    }
+
+    /// Adds a lump to the tissue of a session as [`SessionHandle::add_lump`] does, if its thread has the time for the new steps. Blocks
+    /// while the tissue is compiled.
+    ///
+    /// # Errors
+    /// Returns the refusals of [`SessionHandle::add_lump`], and refuses as [`Pacer::change_tissue`] does.
+    pub fn add_lump(
+        &self,
+        handle: &SessionHandle,
+        lump: impl Fn(&[Lump]) -> Result<Lump>,
+        stop: &AtomicBool,
+    ) -> Result<(u64, Arc<Model>)> {
+        handle.add_lump(lump, |needed| self.check_share(self.taken_by_others(handle), needed), stop)
     }
 
     /// Returns the fraction of a session's thread that other awake sessions take.

@@ -168,7 +168,8 @@ impl ExerciseTask {
             (self.run.end(session).clone(), self.run.answers(session).to_vec());
         let (inbox, begin_step) = (inbox.clone(), self.live.begin_step);
         let work = move || {
-            let ended = EndedExercise { begin_step, figures: moment.figures(), answers };
+            let added_lumps = moment.judge().map_or(Vec::new(), |judge| judge.added_lumps().to_vec());
+            let ended = EndedExercise { begin_step, figures: moment.figures(), answers, added_lumps };
             inbox.send(number, Request::ExerciseEnded(Arc::new(ended)));
             computing.keep();
         };

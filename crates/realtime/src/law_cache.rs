@@ -34,11 +34,12 @@ struct TissueLaws {
     taken: Taken,
 }
 
-/// Returns whether two tissues of one session have equal force laws: equal springs, anchor springs, damping and
+/// Returns whether two tissues of one session have equal force laws: equal springs, lumps, anchor springs, damping and
 /// volume. Their schemes and substeps may differ, and so may scenes on other meshes, which are not compared.
 pub fn have_same_laws(a: &Model, b: &Model) -> bool {
     let [a, b] = [a, b].map(|model| &model.scene);
     a.springs == b.springs
+        && a.added_lumps == b.added_lumps
         && a.anchor_stiffness_n_per_m == b.anchor_stiffness_n_per_m
         && a.damping_n_s_per_m == b.damping_n_s_per_m
         && a.volume_stiffness_pa == b.volume_stiffness_pa

@@ -37,6 +37,7 @@ use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::scene::Change;
+use palpate_tissue::scene::exercise::Lump;
 use palpate_tissue::scene::record::{Point, ToolRecord};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Cuts, Model};
@@ -218,10 +219,36 @@ impl SessionHandle {
         admit: impl Fn(f64) -> Result<()>,
         stop: &AtomicBool,
     ) -> Result<(u64, Arc<Model>)> {
+        let changed = |now: &Model| now.changed_until(change, &self.model.scene, &self.limits, stop);
+        self.exchange_tissue(changed, at_step, admit)
+    }
+
+    /// Adds a lump to the tissue from the beginning of the next step on, as [`SessionHandle::change`] changes it. `lump` chooses it,
+    /// from those that were added before. Returns that step and the new tissue, whose last added lump it is.
+    ///
+    /// # Errors
+    /// Returns the refusals of `lump`, of [`Model::with_lump_until`] and of [`SessionHandle::change`].
+    pub fn add_lump(
+        &self,
+        lump: impl Fn(&[Lump]) -> Result<Lump>,
+        admit: impl Fn(f64) -> Result<()>,
+        stop: &AtomicBool,
+    ) -> Result<(u64, Arc<Model>)> {
+        let with_lump = |now: &Model| now.with_lump_until(&lump(&now.scene.added_lumps)?, &self.limits, stop);
+        self.exchange_tissue(with_lump, None, admit)
+    }
+
+    /// Exchanges the tissue for the one that `make` makes of it, from the beginning of step `at_step` on.
+    fn exchange_tissue(
+        &self,
+        make: impl Fn(&Model) -> Result<Arc<Model>>,
+        at_step: Option<u64>,
+        admit: impl Fn(f64) -> Result<()>,
+    ) -> Result<(u64, Arc<Model>)> {
         loop {
             let base = self.at_intake(|intake, _| intake.changed_to());
             let now = base.as_ref().unwrap_or(&self.model);
-            let model = memory::attempt("", || now.changed_until(change, &self.model.scene, &self.limits, stop))?;
+            let model = memory::attempt("", || make(now))?;
             check_work(&model, &self.limits)?;
             // The stepping thread allocates the fields of the new scheme, and a checkpoint.
             memory::check(2 * model.state_bytes(), "another tissue")?;

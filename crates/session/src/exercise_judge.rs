@@ -21,6 +21,8 @@ use palpate_tissue::{Model, TieState};
 pub struct ExerciseJudge {
     exercise: Arc<Exercise>,
     lumps: Vec<Lump>,
+    /// The lumps that the trainer has hidden since.
+    added_lumps: Arc<[Lump]>,
     tasks: TaskMeasures,
     /// The point nearest to the place that must be lifted.
     lifted: Option<PointId>,
@@ -86,6 +88,7 @@ impl ExerciseJudge {
         let lift = exercise.lift.map(|lift| LiftTarget { height_m: lift.height_m, hold_s: lift.hold_s });
         Ok(ExerciseJudge {
             lumps,
+            added_lumps: model.scene.added_lumps.clone(),
             tasks: TaskMeasures::new(exercise.seen_along, avoided.collect(), lift),
             lifted: exercise.lift.map(|lift| model.shape().nearest(lift.place_m)),
             begin_step,
@@ -105,6 +108,7 @@ impl ExerciseJudge {
     /// before does not count. Steps that were skipped at rest count as if nothing had changed in them.
     pub fn see(&mut self, session: &Session, rows: &[ToolRow]) {
         let step = session.step_count();
+        self.added_lumps.clone_from(&session.model().scene.added_lumps);
         if step == self.begin_step && !self.is_later_phase {
             self.severed_before = session.tissue().cuts().len();
             self.joints_before = session.tissue().cuts().joint_count();
@@ -171,9 +175,14 @@ impl ExerciseJudge {
         &self.exercise
     }
 
-    /// Returns the lumps that are hidden.
-    pub fn lumps(&self) -> &[Lump] {
-        &self.lumps
+    /// Returns the lumps that are hidden: those with which the exercise began, then those that the trainer has hidden since.
+    pub fn lumps(&self) -> impl Iterator<Item = &Lump> {
+        self.lumps.iter().chain(self.added_lumps.iter())
+    }
+
+    /// Returns the lumps that the trainer has hidden since the exercise began.
+    pub fn added_lumps(&self) -> &[Lump] {
+        &self.added_lumps
     }
 
     /// Returns what was done step by step.
@@ -230,7 +239,7 @@ impl ExerciseJudge {
                 };
                 let target = |lump: &Lump| HiddenTarget { centre_m: lump.centre_m, radius_m: lump.radius_m };
                 // An exercise that never hides anything has no answers.
-                (self.lumps.iter().map(target).collect(), (hidden.count[1] > 0).then_some(rules))
+                (self.lumps().map(target).collect(), (hidden.count[1] > 0).then_some(rules))
             }
         };
         let answer =

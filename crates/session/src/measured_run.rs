@@ -11,6 +11,7 @@ use crate::{RecordedMark, Session};
 use palpate_exercise::{ExerciseTruth, Figure, MeasureOptions, Measures};
 use palpate_refusal::Result;
 use palpate_tissue::Model;
+use palpate_tissue::scene::exercise::Lump;
 use palpate_tissue::scene::script::Script;
 
 /// Measures a session, and judges it by an exercise. Show it the session after each step; what comes after the end of the exercise does not
@@ -59,6 +60,8 @@ pub struct EndedExercise {
     pub figures: MomentFigures,
     /// What was marked.
     pub answers: Vec<RecordedMark>,
+    /// The lumps that the trainer hid while it went on, beside those with which it began.
+    pub added_lumps: Vec<Lump>,
 }
 
 impl MeasuredRun {

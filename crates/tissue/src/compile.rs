@@ -9,6 +9,7 @@ use crate::kernel::lanes;
 use crate::limits::Limits;
 use crate::response::tangent;
 use crate::saved::{CorrectedPlan, SavedPlan};
+use crate::scene::exercise::Lump;
 use crate::scene::{Change, Integrator, Named, Precision, Scene, Stepping};
 use crate::scheme::{Oscillator, entry};
 use crate::select::scheme_selection::{self, Choice};
@@ -221,8 +222,23 @@ impl Model {
         if *change == Change::default() {
             return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
         }
+        self.changed_to(self.scene.changed(change, first), limits, stop)
+    }
+
+    /// Returns the model of the same tissue with a lump more ([`Scene::with_added_lumps`]), for [`Tissue::change`](crate::Tissue::change).
+    /// What stays and what is chosen again is as for [`Model::changed_until`], which see for `stop`.
+    ///
+    /// # Errors
+    /// Refuses what [`Scene::with_added_lumps`] and [`Model::compile`] refuse, and a set `stop`.
+    pub fn with_lump_until(&self, lump: &Lump, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
+        let lumps: Vec<Lump> = self.scene.added_lumps.iter().chain([lump]).copied().collect();
+        let scene = self.scene.with_added_lumps(&lumps)?;
+        self.changed_to(scene, limits, stop)
+    }
+
+    /// Compiles another scene of the same tissue, in the number format of this model.
+    fn changed_to(&self, mut scene: Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         let asked = self.scene.stepping.clone();
-        let mut scene = self.scene.changed(change, first);
         scene.stepping.precision = self.precision;
         let mut model = self.compile_corrected(&scene, limits, stop)?;
         model.scene.stepping = asked;

@@ -252,7 +252,7 @@ impl ScoredExercise {
                 .flat_map(|ExerciseScore { criteria, .. }| criteria.iter().map(criterion))
                 .collect(),
             phases: judge.exercise().phases.iter().zip(&ended.phases).map(phase).collect(),
-            lumps: judge.lumps().iter().map(lump).collect(),
+            lumps: judge.lumps().map(lump).collect(),
             answers: judge.answers(session).iter().map(answer).collect(),
         }
     }

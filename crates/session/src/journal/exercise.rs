@@ -4,6 +4,7 @@ use palpate_exercise::{Figure, register};
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::journal as pb;
 
+use super::lumps::{from_lumps, lumps};
 use crate::RecordedMark;
 use crate::chosen_exercise::ChosenExercise;
 use crate::exercise_judge::{EarnedCriterion, ExerciseScore, PhaseFigures};
@@ -87,6 +88,7 @@ pub(super) fn result(end: &EndedExercise) -> pb::ExerciseResult {
         criteria: score.iter().flat_map(|score| score.criteria.iter().map(criterion)).collect(),
         answers: end.answers.iter().map(answer).collect(),
         phases: phases.iter().map(phase).collect(),
+        added_lumps: lumps(&end.added_lumps),
     }
 }
 
@@ -122,5 +124,6 @@ pub fn from_result(result: &pb::ExerciseResult, chosen: &ChosenExercise) -> Ende
         begin_step: result.begin_step,
         figures,
         answers: result.answers.iter().filter_map(answer).collect(),
+        added_lumps: from_lumps(&result.added_lumps),
     }
 }

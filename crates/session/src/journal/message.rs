@@ -12,6 +12,7 @@ use palpate_proto::journal as pb;
 
 use super::exercise;
 use super::format::REPLAYS;
+use super::lumps::{from_lumps, lumps};
 use crate::command::{Command, Due};
 use crate::input::{Felt, Input};
 use crate::rules::Rules;
@@ -196,7 +197,17 @@ pub fn tissue(model: &Model) -> pb::Tissue {
         expected_error: expected_error.is_finite().then_some(expected_error),
         corrected_integrator: corrected.map(|plan| plan.integrator.name().to_owned()).unwrap_or_default(),
         corrected_substeps: corrected.map(|plan| plan.least_substeps).unwrap_or_default(),
+        added_lumps: lumps(&model.scene.added_lumps),
     }
+}
+
+/// Returns the scene in which the coefficients of a message act: that with which a session began, with the lumps that were added.
+///
+/// # Errors
+/// Refuses lumps that this tissue can't have.
+pub(super) fn scene_of(first: &Scene, message: &pb::Tissue) -> Result<Scene> {
+    let lumps = from_lumps(&message.added_lumps);
+    if lumps[..] == first.added_lumps[..] { Ok(first.clone()) } else { first.with_added_lumps(&lumps) }
 }
 
 /// Returns the tissue in a message, of a session that began with the tissue of `first`, under [`limits`] of `given`.
@@ -228,7 +239,7 @@ fn compiled(first: &Scene, message: &pb::Tissue, limits: &Limits) -> Result<Arc<
         expected_error: message.expected_error.unwrap_or(f64::INFINITY),
         corrected,
     };
-    Model::resumed(first, &state, limits)
+    Model::resumed(&scene_of(first, message)?, &state, limits)
 }
 
 /// Tips of tools, from the poses of a batch so far: a pose with the tip of the previous one leaves it out.

@@ -29,6 +29,9 @@ pub mod file;
 pub mod format;
 pub mod foxglove;
 pub mod inputs;
+#[cfg(test)]
+mod lump_tests;
+mod lumps;
 pub mod message;
 pub mod reader;
 pub mod records;

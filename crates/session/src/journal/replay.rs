@@ -540,8 +540,9 @@ fn saved(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result
         return Err(Refusal::new(Reason::Unreadable, "snapshot", message));
     }
     // Most sessions have the tissue with which they began.
-    let is_first = *saved.tissue() == first.saved_plan();
-    let model = if is_first { first.clone() } else { Model::resumed(&first.scene, saved.tissue(), limits)? };
+    let scene = message::scene_of(&first.scene, &snapshot.tissue.clone().unwrap_or_default())?;
+    let is_first = *saved.tissue() == first.saved_plan() && scene.added_lumps == first.scene.added_lumps;
+    let model = if is_first { first.clone() } else { Model::resumed(&scene, saved.tissue(), limits)? };
     Ok((saved, model))
 }
 

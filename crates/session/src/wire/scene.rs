@@ -54,6 +54,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         body: substance.body,
         material: substance.material,
         inclusions: substance.inclusions,
+        added_lumps: Arc::default(),
         springs: substance.springs,
         anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
         damping_n_s_per_m: substance.damping_n_s_per_m,
@@ -456,7 +457,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         mesh: of_mesh.map(mesh),
         solid: if let Body::Solid(solid) = &scene.body { Some(self::solid(solid)) } else { None },
         material: scene.material.as_ref().map(material),
-        inclusions: scene.inclusions.iter().map(inclusion).collect(),
+        inclusions: scene.all_inclusions().iter().map(inclusion).collect(),
         springs: Some(pb::Springs {
             stiffness_n_per_m: Some(scene.springs.stiffness_n_per_m),
             // The edges of a mesh resist shear as well.

@@ -211,6 +211,13 @@ impl<T: Real> SweepTables<T> {
         }
     }
 
+    /// Follows a model in which other springs are stiff; the points, their masses and what is severed stay.
+    pub(crate) fn follow_lumps(&mut self, model: &Model) {
+        let cuts = self.severed.cuts().clone();
+        *self = SweepTables::new(model, self.layout, self.springs.clone());
+        self.set_severed(model, &cuts);
+    }
+
     /// Returns the tables of a copy for reading, without those for sweeps.
     pub(crate) fn for_copy(&self) -> Self {
         SweepTables {

@@ -215,22 +215,30 @@ impl HiddenLumps {
         let count = (dice.within(least as f64, most as f64 + 1.0) as u64).min(most);
         let mut lumps: Vec<Lump> = Vec::new();
         for _ in 0..count {
-            let mut lump = || Lump {
-                radius_m: dice.within(self.radius_m[0], self.radius_m[1]),
-                stiffness_factor: dice.within(self.stiffness_factor[0], self.stiffness_factor[1]),
-                centre_m: DVec3::from_array(std::array::from_fn(|axis| {
-                    dice.within(self.from_m[axis], self.to_m[axis])
-                })),
-            };
-            let is_free = |lump: &Lump| {
-                lumps.iter().all(|other| {
-                    other.centre_m.distance(lump.centre_m) >= other.radius_m + lump.radius_m + self.apart_m
-                })
-            };
-            let free = (0..MAX_DRAWS).map(|_| lump()).find(is_free)?;
+            let free = self.free_lump(&mut dice, &lumps)?;
             lumps.push(free);
         }
         Some(lumps)
+    }
+
+    /// Returns another lump of a seed, at least `apart_m` from `others`; `None` if the box has no room for it. Equal seeds give equal
+    /// lumps on every machine.
+    pub fn another(&self, seed: u64, others: &[Lump]) -> Option<Lump> {
+        self.free_lump(&mut Dice::new(seed), others)
+    }
+
+    fn free_lump(&self, dice: &mut Dice, others: &[Lump]) -> Option<Lump> {
+        let mut lump = || Lump {
+            radius_m: dice.within(self.radius_m[0], self.radius_m[1]),
+            stiffness_factor: dice.within(self.stiffness_factor[0], self.stiffness_factor[1]),
+            centre_m: DVec3::from_array(std::array::from_fn(|axis| dice.within(self.from_m[axis], self.to_m[axis]))),
+        };
+        let is_free = |lump: &Lump| {
+            others
+                .iter()
+                .all(|other| other.centre_m.distance(lump.centre_m) >= other.radius_m + lump.radius_m + self.apart_m)
+        };
+        (0..MAX_DRAWS).map(|_| lump()).find(is_free)
     }
 }
 

@@ -8,6 +8,7 @@ use glam::{DMat3, DVec3};
 use super::membrane::settled_energy_j;
 use super::mesh::{Mesh, MeshShape, PerNodeFactors, group_named};
 use crate::scene::action_check::physical;
+use crate::scene::exercise::Lump;
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive, unsigned_zero};
@@ -299,6 +300,12 @@ pub(super) const MAX_INCLUSIONS: usize = 256;
 const MAX_LOOKED_AT: usize = 8_000_000;
 
 impl Inclusion {
+    /// Creates the inclusion of a lump.
+    pub fn of_lump(lump: &Lump) -> Self {
+        let region = Region::Ball { centre_m: lump.centre_m, radius_m: lump.radius_m };
+        Inclusion { stiffness_factor: lump.stiffness_factor, ..Inclusion::even(region) }
+    }
+
     /// Creates an inclusion whose factors are 1 and whose edge is 0 wide, so that it changes nothing: a start
     /// for others.
     pub fn even(region: Region) -> Self {
@@ -380,8 +387,8 @@ impl Inclusion {
         parts
     }
 
-    /// Returns the mesh with inclusions applied; where several overlap, or the mesh has factors already, the
-    /// factors multiply. The result has no volume, unless the list is empty: then the mesh is unchanged.
+    /// Returns the mesh with inclusions applied, in place of those that it had; where several overlap, or the mesh has factors of its
+    /// own, the factors multiply. The result has no volume, unless neither had inclusions: then the mesh is unchanged.
     /// `field` is the key of the list in refusals (`field[n].key` for inclusion n).
     ///
     /// # Errors
@@ -399,13 +406,17 @@ impl Inclusion {
         for (index, inclusion) in inclusions.iter().enumerate() {
             inclusion.check(&format!("{field}[{index}]"), shape)?;
         }
-        if inclusions.is_empty() {
+        if inclusions.is_empty() && !mesh.has_inclusions() {
             return Ok(mesh.clone());
+        }
+        if inclusions.is_empty() {
+            let own = PerNodeFactors::clone(&mesh.own_differences);
+            return Ok(Mesh::uneven(mesh.point_mass_kg, mesh.bending, shape.clone(), own));
         }
         let or = |list: &[f64], value: f64, length: usize| {
             if list.is_empty() { vec![value; length] } else { list.to_vec() }
         };
-        let known = &mesh.differences;
+        let known = &mesh.own_differences;
         let mut differences = PerNodeFactors {
             relative_mass: known.relative_mass.clone(),
             extra_anchor: or(&known.extra_anchor, 0.0, count),
@@ -428,7 +439,8 @@ impl Inclusion {
         if differences.extra_anchor.iter().all(|extra| *extra == 0.0) {
             differences.extra_anchor = Vec::new();
         }
-        Ok(Mesh::uneven(mesh.point_mass_kg, mesh.bending, shape.clone(), differences))
+        let made = Mesh::uneven(mesh.point_mass_kg, mesh.bending, shape.clone(), differences);
+        Ok(Mesh { own_differences: mesh.own_differences.clone(), ..made })
     }
 }
 

@@ -47,13 +47,15 @@ pub struct Mesh {
     pub shape: Arc<MeshShape>,
     /// How the points and springs differ from the reference values; empty lists if they don't.
     pub differences: Arc<PerNodeFactors>,
+    /// How they differ without inclusions ([`Inclusion::put_into`](super::material::Inclusion::put_into)).
+    pub(super) own_differences: Arc<PerNodeFactors>,
     /// An upper bound of the stiffness of the springs, which limits the substep, and the vertex where it is
     /// largest.
     pub stiffest: StiffnessBound,
     /// The enclosed volume, if it resists changes (section `[volume]`, [`Mesh::enclosing`]); otherwise `None`.
     pub volume: Option<Arc<Volume>>,
     /// Whether a movable point has no anchor, whatever K″ is: then nothing bounds how far a small force moves it.
-    has_free_point: bool,
+    pub(super) has_free_point: bool,
 }
 
 /// Masses and stiffnesses of single points and springs, relative to the reference values of the scene. A list
@@ -187,9 +189,24 @@ impl Mesh {
         let is_free =
             |(vertex, extra): (usize, &f64)| *extra <= -1.0 && shape.is_used(vertex) && !shape.is_fixed[vertex];
         let has_free_point = differences.extra_anchor.iter().enumerate().any(is_free);
-        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None, has_free_point };
+        let own_differences = differences.clone();
+        let mut mesh = Mesh {
+            point_mass_kg,
+            bending,
+            shape,
+            differences,
+            own_differences,
+            stiffest,
+            volume: None,
+            has_free_point,
+        };
         mesh.stiffest = mesh.find_stiffest();
         mesh
+    }
+
+    /// Returns whether inclusions are applied to its springs.
+    pub(super) fn has_inclusions(&self) -> bool {
+        !Arc::ptr_eq(&self.differences, &self.own_differences)
     }
 
     /// Adds the volume that the mesh encloses, from its rest shape and its present springs and masses.

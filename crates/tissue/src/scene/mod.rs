@@ -114,6 +114,8 @@ pub struct Scene {
     /// Regions of a mesh that are stiffer or softer, in the order of the file; empty on a sheet. Their factors
     /// are already applied to the springs of `body`.
     pub inclusions: Arc<[Inclusion]>,
+    /// Lumps that were added beside the inclusions while a session ran ([`Scene::with_added_lumps`]); their factors are applied as well.
+    pub added_lumps: Arc<[Lump]>,
     /// Springs between neighbours; on a mesh, their reference k.
     pub springs: Springs,
     /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq.
@@ -313,12 +315,31 @@ impl Scene {
             damping_n_s_per_m: self.damping_n_s_per_m * ratio.powi(3),
             volume_stiffness_pa: self.volume_stiffness_pa,
         };
-        let Substance { body, springs, damping_n_s_per_m, .. } =
-            bare.with(self.inclusions.to_vec(), "inclusion").ok()?;
+        let Substance { body, springs, damping_n_s_per_m, .. } = bare.with(self.all_inclusions(), "inclusion").ok()?;
         Some(Scene { body, springs, damping_n_s_per_m, ..self.clone() })
     }
 
-    /// Returns the scene of the same tissue without its inclusions.
+    /// Returns the inclusions, and behind them the lumps that were added.
+    pub fn all_inclusions(&self) -> Vec<Inclusion> {
+        self.inclusions.iter().cloned().chain(self.added_lumps.iter().map(Inclusion::of_lump)).collect()
+    }
+
+    /// Returns the scene of the same tissue with these lumps beside its inclusions, in place of those that were added before. Nothing
+    /// else differs: not the points, nor their masses.
+    ///
+    /// # Errors
+    /// Refuses a tissue that can have no lumps, one of them that reaches nothing of it, and more inclusions than a tissue may have, with
+    /// the field `lump`.
+    pub fn with_added_lumps(&self, lumps: &[Lump]) -> Result<Self> {
+        if matches!(self.body, Body::Sheet(_)) && !lumps.is_empty() {
+            return Err(Refusal::new(Reason::WrongKind, "lump", Material::OF_A_MESH));
+        }
+        let scene = Scene { added_lumps: lumps.into(), ..self.clone() };
+        let body = self.body_with(scene.all_inclusions(), "lump")?;
+        Ok(Scene { body, ..scene })
+    }
+
+    /// Returns the scene of the same tissue without its inclusions and lumps.
     ///
     /// # Errors
     /// Refuses a mesh that does not enclose its volume any more, which no scene has that was read.
@@ -331,12 +352,16 @@ impl Scene {
     /// # Errors
     /// Refuses what [`Scene::without_inclusions`] refuses, a lump in a tissue that can have none, and one that reaches nothing of it.
     pub fn with_lump(&self, lump: &Lump) -> Result<Self> {
-        let region = Region::Ball { centre_m: lump.centre_m, radius_m: lump.radius_m };
-        let inclusion = Inclusion { stiffness_factor: lump.stiffness_factor, ..Inclusion::even(region) };
-        self.without_inclusions()?.with_inclusions(vec![inclusion])
+        self.with_inclusions(vec![Inclusion::of_lump(lump)])
     }
 
     fn with_inclusions(&self, inclusions: Vec<Inclusion>) -> Result<Self> {
+        let body = self.body_with(inclusions.clone(), "inclusion")?;
+        Ok(Scene { body, inclusions: inclusions.into(), added_lumps: Arc::default(), ..self.clone() })
+    }
+
+    /// Returns the body with inclusions in place of all that it has; `field` is the key of the list in refusals.
+    fn body_with(&self, inclusions: Vec<Inclusion>, field: &str) -> Result<Body> {
         let substance = Substance {
             body: self.body.clone(),
             material: None,
@@ -346,10 +371,11 @@ impl Scene {
             damping_n_s_per_m: self.damping_n_s_per_m,
             volume_stiffness_pa: self.volume_stiffness_pa,
         };
-        let bare = substance.with(inclusions, "inclusion")?;
-        let encloses = self.volume_stiffness_pa > 0.0;
-        let Substance { body, .. } = if encloses { bare.enclosing(self.volume_stiffness_pa)? } else { bare };
-        Ok(Scene { body, inclusions: Arc::default(), ..self.clone() })
+        match substance.with(inclusions, field)?.body {
+            // Its volume is there, however soft.
+            Body::Mesh(mesh) if self.volume().is_some() => Ok(Body::Mesh(mesh.enclosing()?)),
+            body => Ok(body),
+        }
     }
 
     /// Reads a scene file and applies the `--set` assignments (`key.path=value`), in their order, which
@@ -418,6 +444,7 @@ impl Scene {
                 body: substance.body,
                 material: substance.material,
                 inclusions: substance.inclusions,
+                added_lumps: Arc::default(),
                 springs: substance.springs,
                 anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
                 damping_n_s_per_m: substance.damping_n_s_per_m,

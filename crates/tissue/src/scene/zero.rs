@@ -33,7 +33,7 @@ fn unsigned_tie(tie: Tie) -> Tie {
 
 impl Scene {
     /// Returns the scene with every −0 among its coefficients and tolerances replaced by 0. Values that must be
-    /// above 0 need no replacement; those of body, material and inclusions stay. Each field is named here, so
+    /// above 0 need no replacement; those of body, material, inclusions and lumps stay. Each field is named here, so
     /// that a new field can't be forgotten.
     #[must_use]
     pub fn with_unsigned_zeros(self) -> Self {
@@ -42,6 +42,7 @@ impl Scene {
             body,
             material,
             inclusions,
+            added_lumps,
             springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, bending, pretension_n_per_m },
             anchor_stiffness_n_per_m,
             damping_n_s_per_m,
@@ -56,6 +57,7 @@ impl Scene {
             body,
             material,
             inclusions,
+            added_lumps,
             springs: Springs {
                 stiffness_n_per_m: unsigned_zero(stiffness_n_per_m),
                 shear_stiffness_n_per_m: unsigned_zero(shear_stiffness_n_per_m),

@@ -444,7 +444,7 @@ impl<T: Real> TissueState<T> {
             let scene = &model.scene;
             let springs = scene.springs.clone();
             let coefficients = [scene.anchor_stiffness_n_per_m, scene.damping_n_s_per_m, scene.volume_stiffness_pa];
-            (springs, coefficients, model.plan.integrator)
+            (springs, coefficients, model.plan.integrator, scene.added_lumps.clone())
         };
         tissue(&self.model) == tissue(model)
     }
@@ -456,9 +456,13 @@ impl<T: Real> TissueState<T> {
         self.state.d.iter_mut().for_each(|d| *d = *d * ratio);
 
         let layout = self.tables.layout;
+        let has_other_lumps = self.model.scene.added_lumps != model.scene.added_lumps;
         self.model = model.clone();
         self.plan = model.plan.clone();
         self.tables.springs = springs_of(model, &self.plan);
+        if has_other_lumps {
+            self.tables.follow_lumps(model);
+        }
         let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
         self.state.kept = State::at_rest(&layout, kept).kept;
         self.applied.forget();
