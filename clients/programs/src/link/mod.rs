@@ -132,6 +132,9 @@ pub(crate) struct LinkArguments {
     /// a solid the top]
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["random", "boundary"])]
     place: Vec<f64>,
+    /// The client is a trainee's: what it is told of the tissue is without lumps, and it gets no copy of it
+    #[arg(long, conflicts_with_all = ["instrument", "collision", "tissue_change_s", "server", "random", "boundary"])]
+    hides_lumps: bool,
     /// The tool's tip: disc (an even pressure), rigid (a rigid disc) or sphere; the last two need a solid [default: sphere on a
     /// solid, which is unstable under an even pressure that is deep; disc on other tissues]
     #[arg(long, value_name = "SHAPE", conflicts_with = "random")]
@@ -291,7 +294,9 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let spot = Spot::new(&model, near_m, &tip);
     // A server first sends the law of the middle, and before the first press that of the place.
     let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
-    let laws = Arc::new(PlaceLaws::new(&model, tip.shape));
+    let told =
+        if arguments.hides_lumps { &Model::compile(&model.scene.without_inclusions()?, &limits)? } else { &model };
+    let laws = Arc::new(PlaceLaws::new(told, tip.shape));
     let law = law_of(&laws, disc)?;
     let second = "from 0 to 1000";
     let second_m = 1e-3 * number("--second-tool-mm", arguments.second_tool_mm, second, |v| (0.0..=1e3).contains(&v))?;
@@ -305,7 +310,12 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
         changed(&model, tip.shape, at_s, factor)
     });
     let change = change.transpose()?;
-    let usual = if model.shape().is_uniform() { Rendering::Model } else { Rendering::Prediction };
+    let has_copy = !model.shape().is_uniform() && !arguments.hides_lumps;
+    let usual = if has_copy { Rendering::Prediction } else { Rendering::Model };
+    if arguments.hides_lumps && arguments.scheme == Some(Rendering::Prediction) {
+        let message = "prediction: renders from a copy of the tissue, which --hides-lumps gives no client";
+        return Err(Refusal::new(Reason::WrongKind, "--scheme", message));
+    }
     let (scheme, seed) = (arguments.scheme.unwrap_or(usual), arguments.seed);
     Ok(Setup {
         model,
