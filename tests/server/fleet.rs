@@ -10,12 +10,13 @@ use std::time::Duration;
 
 use crate::common::authority::Authority;
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{self, FLEETS, create, goes_on, owner, three, until, until_stood_by, verify};
-use crate::common::server::{self, TestServer, TestTouch, force, waiting};
+use crate::common::fleet::{self, FLEETS, Node, create, goes_on, owner, three, until, until_stood_by, verify};
+use crate::common::server::{self, TestServer, TestTouch, force, told, waiting};
 use palpate_proto::pb;
 use palpate_refusal::status::elsewhere;
 use palpate_session::journal::file;
 use pb::touch_response::Message as Heard;
+use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 use tokio::sync::SemaphorePermit;
 use tonic::Code;
@@ -98,6 +99,39 @@ async fn a_server_of_no_fleet_says_so() {
         let told = String::from_utf8_lossy(&refused.stderr).into_owned();
         assert!(!refused.status.success() && told.contains(missing), "{arguments:?}: {told}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_fleet_makes_no_sessions_for_exercises_and_loses_none_that_a_server_brings() {
+    let Some((_turn, folder, etcd)) = fleet_turn().await else { return };
+    let chosen = || {
+        let source = Some(pb::chosen_exercise::Source::Name("lumps-1".to_owned()));
+        pb::create_session_request::Source::Exercise(pb::ChosenExercise { source, ..Default::default() })
+    };
+    let journals = folder.path().join("n0");
+    let mut alone = TestServer::start(&["--journal", journals.to_str().unwrap()]);
+    let made = alone.create(chosen(), true).await.unwrap();
+    let (id, trainee_id) = (made.session_id, made.exercise.unwrap().trainee_id);
+    kill_process(Pid::from_child(&alone.child), Signal::TERM).unwrap();
+    alone.child.wait().unwrap();
+    let nodes = [
+        Node::start(folder.path(), "n0", &etcd.endpoints(), &[]),
+        Node::start(folder.path(), "n1", &etcd.endpoints(), &[]),
+    ];
+    for node in &nodes {
+        let refused = node.there().create(chosen(), true).await.unwrap_err();
+        let (code, reason, field) = told(&refused);
+        assert_eq!((code, reason.as_str(), field.as_str()), (Code::FailedPrecondition, "NOT_AVAILABLE", "exercise"));
+    }
+    assert!(nodes[0].session(&id).await.unwrap().exercise.unwrap().seed.is_some());
+    until("the other server is known", async || {
+        let request = pb::MoveSessionRequest { session_id: id.clone(), node: "n1".to_owned() };
+        let refused = nodes[0].admin().await.move_session(request).await.unwrap_err();
+        told(&refused).1 == "NOT_AVAILABLE"
+    })
+    .await;
+    let seen = nodes[0].session(&trainee_id).await.unwrap().exercise.unwrap();
+    assert_eq!(seen.role(), pb::ExerciseRole::Trainee);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

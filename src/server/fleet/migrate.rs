@@ -160,6 +160,11 @@ impl Fleet {
                 "a session that plays a recording can't be moved",
             ));
         }
+        // Of a session that was made before its server came to the fleet.
+        if handle.exercise.is_some() {
+            let message = "is made for an exercise: what is measured of it, and the trainee's ID, don't move";
+            return Err(Refusal::new(Reason::NotAvailable, "session_id", message));
+        }
         let _moving = self.begins_to_move(&handle.id)?;
         self.ends_naming(&handle.id).await?;
         let (say, said) = mpsc::channel(16);
