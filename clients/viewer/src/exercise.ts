@@ -88,6 +88,7 @@ export class ExercisePanel {
       phase: this.phase,
       advised: this.advised,
       finished: this.result !== undefined,
+      lumpsTold: this.result?.lumps.length ?? 0,
       scorePercent: this.result?.scorePercent,
     };
   }

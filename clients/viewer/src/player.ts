@@ -221,18 +221,23 @@ export class Player {
     return recording.clamp(Math.max(newest, Number(session.step)));
   }
 
+  /** Whether the shown or chosen step is the end of the playback. */
+  private get aimsAtEnd(): boolean {
+    const end = this.opened?.session.playback?.endStep;
+    return end !== undefined && this.step >= Number(end);
+  }
+
   /** Whether the end of the playback was reached. */
   private get isAtEnd(): boolean {
-    const end = this.opened?.session.playback?.endStep;
-    return end !== undefined && this.aimed === undefined && this.step >= Number(end);
+    return this.aimed === undefined && this.aimsAtEnd;
   }
 
   toggle(): void {
     if (!this.opened) return;
     this.isPlaying = !this.isPlaying;
     const { recording } = this.opened;
-    // At its end, playing starts again from the beginning.
-    if (this.isPlaying && this.isAtEnd && !recording.isLive) this.seek(recording.begin);
+    // At its end, playing starts again from the beginning, also while another speed is on its way.
+    if (this.isPlaying && this.aimsAtEnd && !recording.isLive) this.seek(recording.begin);
     else void this.follow();
   }
 

@@ -116,9 +116,17 @@ describe("an exercise", () => {
     assert.match((await looking.text("exercise-score")) ?? "", /\d+ %|none/);
     await looking.picture("exercise-trainer");
     await trainer.screenshot({ path: "../../target/viewer/exercise-trainees.png" });
+    for (let lumps = 0; lumps < 4; lumps++) {
+      await trainer.evaluate(() => document.getElementById("said")?.replaceChildren());
+      await row.getByText("Another lump").click();
+      await trainer.locator("#said").getByText(/Ada has another lump, 1[0-6] mm wide/).waitFor();
+    }
+    assert.equal((await trainee.ask(({ exercise }) => exercise)).advised, 2);
     await row.getByText("Finish").click();
     await trainee.until(({ exercise }) => exercise.finished && exercise.isDebriefing);
+    assert.ok((await trainee.ask(({ exercise }) => exercise)).lumpsTold >= 1 + 4);
     await row.getByText(/Finished after/).waitFor();
+    await row.getByText("Another lump").waitFor({ state: "hidden" });
     assert.deepEqual([...trainee.complaints, ...looking.complaints], []);
     await close(looking);
     await close(trainee);
