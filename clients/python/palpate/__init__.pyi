@@ -267,16 +267,6 @@ class Session:
     def mark(self, tool: int, place_m: Vector, *, diameter_m: Optional[float] = None) -> None:
         """Marks a place of the surface, m, as an answer in an exercise: what you look for is there, or below it, and has about this
         diameter, m. It changes nothing, and the tool does what it did."""
-    def hide_lump(
-        self,
-        *,
-        centre_m: Optional[Vector] = None,
-        radius_m: Optional[float] = None,
-        stiffness_factor: Optional[float] = None,
-    ) -> dict[str, Any]:
-        """Hides another lump in the tissue while the exercise goes on: drawn as the exercise draws its lumps, or the given one
-        (`centre_m` and `radius_m`, m, and `stiffness_factor`, all three). Returns these of the lump, and the `step` from which on it is
-        there. For trainers."""
     def untie(self, tool: int, number: int) -> None:
         """Cuts a thread or clip, and takes it out."""
     @property
@@ -531,6 +521,16 @@ class RemoteSession:
         phase what `finish_exercise` returns."""
     def advise(self, text: str = "", *, place_m: Optional[Vector] = None) -> None:
         """Sends the trainee a hint (a text), or a marker at a place of the surface at rest, m. For trainers."""
+    def hide_lump(
+        self,
+        *,
+        centre_m: Optional[Vector] = None,
+        radius_m: Optional[float] = None,
+        stiffness_factor: Optional[float] = None,
+    ) -> dict[str, Any]:
+        """Hides another lump in the tissue while the exercise goes on: drawn as the exercise draws its lumps, or the given one
+        (`centre_m` and `radius_m`, m, and `stiffness_factor`, all three). Returns these of the lump, and the `step` from which on it is
+        there. For trainers."""
     def untie(self, tool: int, number: int) -> None:
         """Cuts a thread or clip, and takes it out; acquires the tool first if needed."""
     def release(self, tool: int) -> None:
