@@ -94,7 +94,7 @@ struct Crossing {
 
 /// How far a spring is stretched, seen from one of its ends.
 #[derive(Debug, Clone, Copy)]
-struct Stretch {
+struct SpringStretch {
     /// The vector to the other end at rest, m.
     rest_m: DVec3,
     /// The displacement of the other end from that, m.
@@ -290,7 +290,7 @@ impl<T: Real> TissueState<T> {
         for place in ends {
             self.tiles.wake_around(model.point_of(place), self.plan.scheme.sweeps());
         }
-        let Stretch { rest_m, delta_m, extension, along } = self.stretch(place, &spring);
+        let SpringStretch { rest_m, delta_m, extension, along } = self.stretch(place, &spring);
         // The force of the spring, less what a pretension leaves of it.
         let stiffness_n_per_m = self.tables.severed.burnt().of_spring(ends) * spring.stiffness_n_per_m;
         let (tension_n_per_m, slack_n_per_m) = (spring.tension_n_per_m, stiffness_n_per_m - spring.tension_n_per_m);
@@ -306,7 +306,7 @@ impl<T: Real> TissueState<T> {
     }
 
     /// Returns how far a spring of a place is stretched.
-    fn stretch(&self, place: usize, spring: &SpringEnd) -> Stretch {
+    fn stretch(&self, place: usize, spring: &SpringEnd) -> SpringStretch {
         let (model, layout) = (&self.model, &self.tables.layout);
         let u_m = |place: usize| displacement_m(model, layout, &self.state, model.point_of(place));
         let (rest_m, delta_m) = (model.unit_m * spring.rest, u_m(spring.other) - u_m(place));
@@ -314,7 +314,7 @@ impl<T: Real> TissueState<T> {
         let q = ((2.0 * rest_m + delta_m).dot(delta_m) / rest_m.length_squared()).max(-1.0);
         let s = (1.0 + q).sqrt();
         let extension = q / (1.0 + s);
-        Stretch { rest_m, delta_m, extension, along: if s > 0.0 { extension / s } else { 0.0 } }
+        SpringStretch { rest_m, delta_m, extension, along: if s > 0.0 { extension / s } else { 0.0 } }
     }
 
     /// Takes a force of a spring on the point at a place, N, out of the past forces that a multistep scheme keeps: that of a severed spring.

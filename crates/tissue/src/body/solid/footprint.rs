@@ -44,13 +44,15 @@ fn divided(triangles: &[[DVec3; 3]], spacing_m: f64) -> Vec<RestPart> {
         let longest_m = (b - a).length().max((c - b).length()).max((a - c).length());
         let parts = (longest_m / spacing_m).ceil().clamp(1.0, MAX_SIDE_PARTS);
         let outward_m2 = 0.5 * (b - a).cross(c - a) / (parts * parts);
+        let area_m2 = outward_m2.length();
+        // A triangle without an area has no direction either.
+        if area_m2 == 0.0 {
+            continue;
+        }
         let (along, across) = ((b - a) / parts, (c - a) / parts);
         let mut add = |by_along: f64, by_across: f64| {
             let rest_m = a + by_along * along + by_across * across;
-            let area_m2 = outward_m2.length();
-            if area_m2 > 0.0 {
-                divided.push(RestPart { rest_m, outward_m2, area_m2 });
-            }
+            divided.push(RestPart { rest_m, outward_m2, area_m2 });
         };
         let parts = parts as u32;
         for i in 0..parts {

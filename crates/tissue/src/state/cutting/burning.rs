@@ -11,7 +11,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{Crossing, Stretch};
+use super::{Crossing, SpringStretch};
 use crate::body::tables::StiffenedSpring;
 use crate::kernel::real::Real;
 use crate::state::tissue_state::TissueState;
@@ -79,7 +79,7 @@ impl<T: Real> TissueState<T> {
             return;
         }
         for StiffenedSpring { place, spring, factors: [was, now] } in self.tables.set_burnt(&model, burnt) {
-            let Stretch { rest_m, delta_m, extension, along } = self.stretch(place, &spring);
+            let SpringStretch { rest_m, delta_m, extension, along } = self.stretch(place, &spring);
             let added_n_per_m = (now - was) * spring.stiffness_n_per_m;
             let force_n = added_n_per_m * along * (rest_m + delta_m);
             self.take_from_history(place, -force_n);
