@@ -240,7 +240,7 @@ mod tests {
 
     use super::*;
     use crate::input::Input;
-    use crate::journal::{JournalReader, JournalWriter, Opening, Replay, ReplayEvent, pb};
+    use crate::journal::{JournalReader, JournalWriter, Replay, ReplayEvent, pb};
     use crate::simulation::Simulation;
     use palpate_exercise::{Figure, ToolLimits};
     use palpate_tissue::limits::Limits;
@@ -294,21 +294,7 @@ mod tests {
     fn a_journal_gives_the_bits_of_the_figures_of_the_session_that_it_recorded() {
         let model = liver();
         let script = script(HANDS, &model);
-        let opening = Opening {
-            session_id: "measured",
-            run: 1,
-            owner: "",
-            idle_timeout_s: 900.0,
-            first: &model,
-            begin_step: 0,
-            running: true,
-            until_step: None,
-            ownership_revision: 0,
-            exercise: None,
-        };
-        let mut writer = JournalWriter::new(&opening, 0);
-        let began = Session::new(&model);
-        writer.snapshot(0, began.tissue().state_hash(), &model, began.save().to_bytes());
+        let mut writer = JournalWriter::at_rest(&model);
         let recorded = measured(&model, &script, true, |simulation| {
             for due in &simulation.due {
                 writer.input(simulation.session.step_count(), &Input::Command(due.clone()));

@@ -7,8 +7,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::message::{from_tissue, tissue};
-use super::{JournalReader, JournalWriter, Opening, Replay, pb};
-use crate::Session;
+use super::{JournalReader, JournalWriter, Replay, pb};
 use crate::input::Input;
 use crate::simulation::Simulation;
 use palpate_tissue::Model;
@@ -48,21 +47,7 @@ fn a_lump_is_felt_from_the_step_on_at_which_it_is_added_and_a_replay_has_it_with
              falloff_per_m = 100.0\nfalloff_offset = 0.0\nprofile = {{ type = \"pulse\", on_s = 0.02, off_s = 0.29 }}\n"
         );
         let script = Script::parse("press", &text, Path::new(""), &model.scene, &limits).unwrap();
-        let opening = Opening {
-            session_id: "lumps",
-            run: 1,
-            owner: "",
-            idle_timeout_s: 900.0,
-            first: &model,
-            begin_step: 0,
-            running: true,
-            until_step: None,
-            ownership_revision: 0,
-            exercise: None,
-        };
-        let mut writer = JournalWriter::new(&opening, 0);
-        let began = Session::new(&model);
-        writer.snapshot(0, began.tissue().state_hash(), &model, began.save().to_bytes());
+        let mut writer = JournalWriter::at_rest(&model);
         let mut simulation = Simulation::playing(&model, &script, true, &limits).unwrap();
         let mut without = Simulation::playing(&model, &script, true, &limits).unwrap();
         let lumped = model.with_lump_until(&lump, &limits, &NEVER).unwrap();

@@ -99,6 +99,27 @@ impl JournalWriter {
         JournalWriter::with_header(&opening.message(), unix_ns)
     }
 
+    /// Creates the writer of a journal of a session that runs from its step 0 on, at rest, with a snapshot of that: for tests.
+    #[cfg(test)]
+    pub(crate) fn at_rest(model: &Arc<Model>) -> Self {
+        let opening = Opening {
+            session_id: "tested",
+            run: 1,
+            owner: "",
+            idle_timeout_s: 900.0,
+            first: model,
+            begin_step: 0,
+            running: true,
+            until_step: None,
+            ownership_revision: 0,
+            exercise: None,
+        };
+        let mut writer = JournalWriter::new(&opening, 0);
+        let began = crate::Session::new(model);
+        writer.snapshot(0, began.tissue().state_hash(), model, began.save().to_bytes());
+        writer
+    }
+
     /// Creates a writer with the header of another journal.
     pub(super) fn with_header(header: &pb::Header, unix_ns: u64) -> Self {
         let bytes = header.encode_to_vec();
