@@ -80,7 +80,8 @@ impl Model {
     pub(crate) fn end_at_rest_m(&self, place: usize) -> DVec3 {
         match &self.places {
             Places::Solid(places) => places.middle_m(place),
-            Places::Sheet(_) | Places::Surface(_) => self.shape().rest_m(self.point_at(place)),
+            Places::Surface(places) => places.rest_m(place),
+            Places::Sheet(_) => self.shape().rest_m(self.point_at(place)),
         }
     }
 

@@ -21,28 +21,37 @@ const NEARLY: f64 = 1.0 - 1e-5;
 pub(crate) struct SpringSearch {
     /// The corners of the box around the points of each tile at rest, m; the first above the second in an empty tile.
     boxes: Vec<[DVec3; 2]>,
+    /// The same of each row of each tile.
+    row_boxes: Vec<[[DVec3; 2]; TILE]>,
     longest_m: f64,
 }
 
 impl SpringSearch {
     /// Looks at all points of a model.
     pub(crate) fn of(model: &Model, layout: &Layout, tiles: usize) -> Self {
-        let mut boxes = vec![[DVec3::INFINITY, DVec3::NEG_INFINITY]; tiles];
-        let mut longest = 0.0_f64;
-        for (tile, [least_m, most_m]) in boxes.iter_mut().enumerate() {
-            for place in places_of(model, layout, tile) {
-                let mut has_spring = false;
-                model.each_spring(place, |spring| {
-                    has_spring = true;
-                    longest = longest.max(spring.rest.length());
-                });
-                if has_spring {
-                    let rest_m = model.end_at_rest_m(place);
-                    (*least_m, *most_m) = (least_m.min(rest_m), most_m.max(rest_m));
+        const EMPTY: [DVec3; 2] = [DVec3::INFINITY, DVec3::NEG_INFINITY];
+        let join = |[low_m, high_m]: [DVec3; 2], [other_low_m, other_high_m]: [DVec3; 2]| {
+            [low_m.min(other_low_m), high_m.max(other_high_m)]
+        };
+        let mut row_boxes = vec![[EMPTY; TILE]; tiles];
+        let (mut longest, across) = (0.0_f64, model.points[1]);
+        for (tile, boxes) in row_boxes.iter_mut().enumerate() {
+            let [rows, columns] = sides_of(layout, tile);
+            for (row, around) in rows.zip(boxes) {
+                for place in columns.clone().map(|column| row * across + column) {
+                    let mut has_spring = false;
+                    model.each_spring(place, |spring| {
+                        has_spring = true;
+                        longest = longest.max(spring.rest.length());
+                    });
+                    if has_spring {
+                        *around = join(*around, [model.end_at_rest_m(place); 2]);
+                    }
                 }
             }
         }
-        SpringSearch { boxes, longest_m: longest * model.unit_m }
+        let boxes = row_boxes.iter().map(|rows| rows.iter().copied().fold(EMPTY, join)).collect();
+        SpringSearch { boxes, row_boxes, longest_m: longest * model.unit_m }
     }
 
     /// Returns the length of the longest spring at rest, m.
@@ -66,6 +75,23 @@ impl SpringSearch {
         // SAFETY: the field has the layout's three planes, and the tiles are those of the layout.
         unsafe { lanes::run(tables.width, &near) };
         near.found.into_inner()
+    }
+
+    /// Returns the rows of a tile, each with its columns, whose boxes touch that between two corners, m, as those of tiles do in
+    /// [`SpringSearch::near`].
+    pub(crate) fn rows_near(
+        &self,
+        model: &Model,
+        layout: &Layout,
+        NearTile { tile, displaced }: NearTile,
+        [least_m, most_m]: [DVec3; 2],
+    ) -> impl Iterator<Item = (usize, Range<usize>)> {
+        let [down_m, up_m] = displaced.map(|displaced| model.unit_m * displaced);
+        let [rows, columns] = sides_of(layout, tile);
+        rows.zip(&self.row_boxes[tile]).filter_map(move |(row, [low_m, high_m])| {
+            let touches = (*high_m + up_m).cmpge(least_m) & (*low_m + down_m).cmple(most_m);
+            touches.all().then(|| (row, columns.clone()))
+        })
     }
 }
 
@@ -186,10 +212,4 @@ unsafe fn range<V: Vector>(layout: &Layout, plane: &[V::Real], [rows, columns]: 
         high = if most > high { most } else { high };
     }
     [low, high]
-}
-
-/// Returns the places of a tile.
-fn places_of(model: &Model, layout: &Layout, tile: usize) -> impl Iterator<Item = usize> + use<> {
-    let ([rows, columns], across) = (sides_of(layout, tile), model.points[1]);
-    rows.flat_map(move |i| columns.clone().map(move |j| i * across + j))
 }

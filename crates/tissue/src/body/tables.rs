@@ -262,6 +262,13 @@ impl<T: Real> SweepTables<T> {
         Some(doubled)
     }
 
+    /// Makes room for the cubes of a solid beside cuts, which the first cut then need not do.
+    pub(crate) fn prepare_to_cut(&mut self) {
+        if let Some(solid) = &mut self.solid {
+            solid.prepare_to_cut(&self.layout);
+        }
+    }
+
     /// Returns where the corners of a solid's cube beside cuts are in a plane of a field, by its number among these
     /// ([`CornerCopies::cubes`]).
     #[inline]

@@ -9,9 +9,9 @@ use crate::kernel::region::{TILE, tiles};
 /// The tiles next to each tile, and the places beyond a tile that pull at it.
 #[derive(Debug, Default)]
 pub(crate) struct TileLinks {
-    /// The places beyond each tile that are joined to it, ascending; and where each tile's places begin, with the end of
-    /// the last.
-    around: Vec<u32>,
+    /// The row and column of the places beyond each tile that are joined to it, ascending; and where each tile's places begin, with the end
+    /// of the last.
+    around: Vec<[u32; 2]>,
     firsts_around: Vec<usize>,
     /// The tiles of these places, ascending, in the same way.
     beside: Vec<u32>,
@@ -34,7 +34,7 @@ impl TileLinks {
             let mut beside: Vec<u32> = beyond.iter().map(|place| tile_of(*place as usize) as u32).collect();
             beside.sort_unstable();
             beside.dedup();
-            links.around.extend(beyond);
+            links.around.extend(beyond.iter().map(|place| [place / columns as u32, place % columns as u32]));
             links.beside.extend(beside);
             links.firsts_around.push(links.around.len());
             links.firsts_beside.push(links.beside.len());
@@ -48,9 +48,9 @@ impl TileLinks {
         self.beside[range].iter().map(|other| *other as usize)
     }
 
-    /// Returns the places beyond a tile that are joined to it, ascending, and the place of the first in the list of all
-    /// tiles.
-    pub(crate) fn around(&self, tile: usize) -> (&[u32], usize) {
+    /// Returns the row and column of the places beyond a tile that are joined to it, ascending, and the place of the first in the list of
+    /// all tiles.
+    pub(crate) fn around(&self, tile: usize) -> (&[[u32; 2]], usize) {
         let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
         (&self.around[from..to], from)
     }
@@ -65,8 +65,7 @@ impl TileLinks {
         let (places, first) = self.around(tile);
         for c in 0..3 {
             for (place, k) in places.iter().zip(0..) {
-                let at = c * layout.plane + layout.offset(*place as usize);
-                snapshots[3 * first + c * places.len() + k] = u[at];
+                snapshots[3 * first + c * places.len() + k] = u[c * layout.plane + offset(layout, place)];
             }
         }
     }
@@ -82,12 +81,19 @@ impl TileLinks {
     ) -> bool {
         let (places, first) = self.around(tile);
         (0..3).any(|c| {
-            let at = |place: &u32| c * layout.plane + layout.offset(*place as usize);
             let then = &snapshots[3 * first + c * places.len()..][..places.len()];
-            let any = |any: bool, (place, then): (&u32, &T)| any | ((u[at(place)] - *then).magnitude() > far);
+            let plane = &u[c * layout.plane..][..layout.plane];
+            let any =
+                |any: bool, (place, then): (_, &T)| any | ((plane[offset(layout, place)] - *then).magnitude() > far);
             places.iter().zip(then).fold(false, any)
         })
     }
+}
+
+/// Returns where a place is in a plane of a field.
+#[inline]
+fn offset(layout: &Layout, [row, column]: &[u32; 2]) -> usize {
+    *row as usize * layout.stride + *column as usize
 }
 
 /// Returns the places of a tile.

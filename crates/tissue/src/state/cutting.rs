@@ -23,9 +23,8 @@ use glam::DVec3;
 use crate::body::model::{Model, displacement_m};
 use crate::body::severed::{ANCHOR, SeveredSpring};
 use crate::body::spring_ends::SpringEnd;
-use crate::body::spring_search::{NearTile, SpringSearch};
+use crate::body::spring_search::SpringSearch;
 use crate::kernel::real::Real;
-use crate::kernel::region::sides_of;
 use crate::stage_times::StepStage;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::Tool;
@@ -119,8 +118,9 @@ impl Crossing {
 }
 
 impl<T: Real> TissueState<T> {
-    /// Prepares the search for springs that blades cross, once.
+    /// Prepares the search for springs that blades cross, and room for what they sever, once.
     pub(super) fn prepare_to_cut(&mut self) {
+        self.tables.prepare_to_cut();
         if self.spring_search.is_none() {
             let tiles = self.tiles.tile_count();
             self.spring_search = Some(SpringSearch::of(&self.model, &self.tables.layout, tiles));
@@ -208,14 +208,11 @@ impl<T: Real> TissueState<T> {
             };
             (model.unit_m * vector(&state.u), ways * vector(&state.d))
         };
-        for NearTile { tile, .. } in
-            search.near(model, tables, state, &tiles.moved, [least_m - reach_m, most_m + reach_m])
-        {
-            let [rows, columns] = sides_of(layout, tile);
-            // Plain loops: iterators over both are not inlined.
-            for i in rows {
-                for j in columns.clone() {
-                    self.crossed_at(i * across + j, sweep, &is_near, &motion, &mut found);
+        let around_m = [least_m - reach_m, most_m + reach_m];
+        for tile in search.near(model, tables, state, &tiles.moved, around_m) {
+            for (row, columns) in search.rows_near(model, layout, tile, around_m) {
+                for column in columns {
+                    self.crossed_at(row * across + column, sweep, &is_near, &motion, &mut found);
                 }
             }
         }
@@ -234,7 +231,7 @@ impl<T: Real> TissueState<T> {
     ) {
         let TissueState { model, tables, .. } = self;
         let (u_m, way_m) = motion(place);
-        let place_m = model.shape().rest_m(model.point_at(place)) + u_m;
+        let place_m = model.end_at_rest_m(place) + u_m;
         if !is_near(place_m) {
             return;
         }

@@ -42,6 +42,10 @@ impl<T: Real> CutCubes<T> {
         }
     }
 
+    pub(crate) fn is_empty(&self) -> bool {
+        self.corners.is_empty()
+    }
+
     /// Sets where the corners of the cube of a number are; a new one has the next number. `weight` is that of the cube.
     #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn set(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, number: usize) {

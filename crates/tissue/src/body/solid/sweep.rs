@@ -98,7 +98,7 @@ pub(crate) struct SolidTables<T> {
     spans: Vec<Range<usize>>,
     /// The tiles that have corners.
     tiles: Vec<usize>,
-    /// The cubes beside cuts, once there is one.
+    /// The cubes beside cuts, once there is one or may be one soon.
     cut: Option<Box<CutCubes<T>>>,
     buffers: RefCell<Buffers<T>>,
 }
@@ -184,7 +184,7 @@ impl<T: Real> SolidTables<T> {
 
     /// Makes the tables those of a solid with these copies of corners.
     pub(crate) fn follow(&mut self, places: &SolidPlaces, layout: &Layout, copies: Option<&CornerCopies>) {
-        if self.cut.is_some() {
+        if self.cut.as_ref().is_some_and(|cut| !cut.is_empty()) {
             *self = SolidTables::new(places, layout);
         }
         let Some(copies) = copies else { return };
@@ -215,10 +215,14 @@ impl<T: Real> SolidTables<T> {
         }
     }
 
+    /// Makes room for cubes beside cuts, which the first cut then need not do.
+    pub(crate) fn prepare_to_cut(&mut self, layout: &Layout) -> &mut CutCubes<T> {
+        self.cut.get_or_insert_with(|| Box::new(CutCubes::none(layout)))
+    }
+
     /// Takes a cube out of its row.
     fn take_out(&mut self, places: &SolidPlaces, layout: &Layout, copies: &CornerCopies, number: usize) {
-        let cut = self.cut.get_or_insert_with(|| Box::new(CutCubes::none(layout)));
-        cut.set(places, layout, copies, number);
+        self.prepare_to_cut(layout).set(places, layout, copies, number);
         self.weights[layout.offset(copies.cubes()[number].cube as usize)] = T::default();
     }
 
@@ -279,7 +283,7 @@ impl<T: Real, S: Stage<T>> Run<T> for SolidSweep<'_, T, S> {
         // SAFETY: the caller's promise, and the tables are those of the layout.
         unsafe {
             let mut sums = self.stage.begin::<V>();
-            if let Some(cut) = &tables.cut {
+            if let Some(cut) = tables.cut.as_ref().filter(|cut| !cut.is_empty()) {
                 cut.pull::<V, S>(layout, self.grid.law, self.grid.x, self.over, &self.stage);
             }
             for row in self.over.rows(rows + 1, layout.rows) {

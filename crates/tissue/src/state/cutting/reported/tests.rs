@@ -138,3 +138,25 @@ fn springs_that_the_tissue_lacks_are_refused_with_all_others() {
         assert_eq!(copy.cuts().len(), 1);
     }
 }
+
+/// No input of a tool repeats a reported cut, so going back, or a recovery, must not undo it.
+#[test]
+fn the_guard_keeps_a_reported_cut() {
+    for (kind, model) in models() {
+        let mut other = at_rest(&model);
+        cut(&mut *other, 60);
+        let all = reported(&*other);
+        let mut tissue = crate::state::tissue_state::TissueState::<f64>::new(&model);
+        pressed_n(&mut tissue, 100);
+        tissue.take_checkpoint();
+        tissue.sever_reported(&all).unwrap();
+        let severed = names(&tissue);
+        pressed_n(&mut tissue, 20);
+        tissue.go_back(0);
+        assert!(names(&tissue) == severed && !severed.is_empty(), "{kind}");
+        let displaced_m = tissue.largest_displacement_m();
+        assert!(displaced_m > 1e-5, "{kind}: the press of before is kept: {displaced_m} m");
+        tissue.recover(120, false);
+        assert_eq!(names(&tissue), severed, "{kind}");
+    }
+}
