@@ -175,7 +175,7 @@ impl System {
                 stages.extend(tests.map(PlanStage::Step));
             }
         }
-        // These wait for most of their time, so that they run at once.
+        // These wait for most of their time, so that they run beside the tests in Rust.
         let mut waiting = Vec::new();
         if is_asked(TestPart::Python) {
             // The tools for building are those of the environment, so that pip makes none of its own; what is compiled is what
@@ -196,10 +196,8 @@ impl System {
         if is_asked(TestPart::Documents) {
             waiting.push(self.unittest("tests/python"));
         }
-        stages.extend(beside(waiting));
-        if is_asked(TestPart::Rust) {
-            stages.push(self.rust_tests());
-        }
+        let rust = is_asked(TestPart::Rust).then(|| self.rust_tests());
+        stages.extend(beside(rust.into_iter().chain(waiting).collect()));
         if is_asked(TestPart::Abi) {
             if self.has_shell && !self.is_windows {
                 let built = format!("{}/release", self.target);
@@ -221,10 +219,10 @@ impl System {
         Step { arguments: arguments.chain(["--no-run".to_owned()]).collect(), ..step("nice", &[]) }
     }
 
-    fn rust_tests(&self) -> PlanStage {
+    fn rust_tests(&self) -> Step {
         let test = self.cargo(&RUST_TESTS);
         let threads = ("RUST_TEST_THREADS", (TESTS_PER_CORE * self.cores).to_string());
-        PlanStage::Step(Step { variables: vec![(SEED.0, SEED.1.to_owned()), threads], ..test })
+        Step { variables: vec![(SEED.0, SEED.1.to_owned()), threads], ..test }
     }
 
     fn pip(&self, arguments: &[&str]) -> Step {
@@ -372,11 +370,11 @@ mod tests {
                 "(in clients/typescript) npm test   # at the same time",
                 "target/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps \
                  --force-reinstall --config-settings=build-args=--features=workspace-features ./clients/python",
-                "target/venv/bin/python -m unittest discover -s clients/python/tests -v",
+                "PROPTEST_RNG_SEED=20261122 RUST_TEST_THREADS=6 cargo test --release --workspace --no-fail-fast",
+                "target/venv/bin/python -m unittest discover -s clients/python/tests -v   # at the same time",
                 "(in proto/generator) cargo fmt --check   # at the same time",
                 "(in proto/generator) cargo test --quiet --locked --target-dir ../../target/generator   # at the same time",
                 "target/venv/bin/python -m unittest discover -s tests/python -v   # at the same time",
-                "PROPTEST_RNG_SEED=20261122 RUST_TEST_THREADS=6 cargo test --release --workspace --no-fail-fast",
                 "sh tests/abi/check.sh target/release interface",
             ]
         );
@@ -397,7 +395,7 @@ mod tests {
         let bare = System { has_node: false, has_python: false, has_shell: false, ..machine(false) };
         let only_rust = lines(&ProjectTask::Test(vec![TestPart::Rust, TestPart::Protocol]), &bare);
         assert_eq!(only_rust.len(), 4, "{only_rust:?}");
-        assert!(only_rust[0] == WORKSPACE && only_rust[3].contains("cargo test --release"), "{only_rust:?}");
+        assert!(only_rust[0] == WORKSPACE && only_rust[1].contains("cargo test --release"), "{only_rust:?}");
         assert_eq!(
             lines(&ProjectTask::Test(vec![TestPart::Protocol]), &bare).len(),
             2,
