@@ -170,6 +170,12 @@ fn a_score_has_what_the_tools_did_and_sessions_compare() {
         score["limit_crossing_count"] == 1 && crossing["peak"] == peak_n && crossing["limit"] == "force_n",
         "{crossing}"
     );
+    // As a page and as a table too, without a file for the score.
+    let (status, table) =
+        palpate(folder.path(), &["run", "liver", "press", "--output", "r.jsonl", "--report", "run.html"]);
+    let row = |line: &&str| line.starts_with("peak_force_n ");
+    assert!(status == 0 && table.contains("final hash") && table.lines().any(|line| row(&line)), "{table}");
+    assert!(read("run.html").contains("press on liver") && read("run.html").contains("<svg"));
     // The journal is simulated, and gives the same figures on paper and in the file.
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.6.mcap");
     let scored = |more: &[&str]| palpate(folder.path(), &[&["journal", "score", golden], more].concat());
@@ -188,8 +194,16 @@ fn a_score_has_what_the_tools_did_and_sessions_compare() {
     let columns: Vec<usize> = csv.lines().map(|line| line.split(',').count()).collect();
     assert!(columns.len() == 4 && columns.iter().all(|count| *count == columns[0]), "{csv}");
     for (arguments, part) in [
-        (&["run", "liver", "press", "--force-limit-n", "2"][..], "--force-limit-n: goes with --score FILE alone"),
+        (
+            &["run", "liver", "press", "--force-limit-n", "2"][..],
+            "--force-limit-n: goes with --score FILE or --report FILE alone",
+        ),
+        (
+            &["run", "liver", "press", "--exercise", "cut-line"],
+            "--exercise: goes with --score FILE or --report FILE alone",
+        ),
         (&["run", "liver", "indent", "--score", "s.json"], "--score: goes with a script, not with `indent`"),
+        (&["run", "liver", "indent", "--report", "s.html"], "--report: goes with a script, not with `indent`"),
         (&["run", "liver", "press", "--score", "s.json", "--press-n", "-1"], "--press-n: must be above 0"),
         (&["journal", "score", golden, "--hand", "0,1"], "--hand: must be two hands"),
         (&["journal", "score", golden, "--hand", "0", "--hand", "0"], "--hand: a tool must be in one hand only"),
@@ -367,7 +381,26 @@ fn a_script_ends_a_phase_before_its_time_and_what_cannot_be_is_named() {
         ("[[phase_end]]\nat_s = 0.04\n".to_owned(), "phase_end[0]"),
     ] {
         says(run(&ends), 2, &[part]);
+        says(palpate(folder.path(), &["check", "liver", "script.toml", "--exercise", "two.toml"]), 2, &[part]);
     }
+}
+
+#[test]
+fn check_warns_of_a_phase_without_time_and_of_a_file_of_another_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let checked = |limit_s: f64, file: &str| {
+        let exercise = format!(
+            "name = \"two\"\ninstructions = \"Look, and press.\"\nscenes = [\"liver\"]\ntime_limit_s = {limit_s}\n\
+             [[phase]]\ntitle = \"Look\"\ninstructions = \"Look.\"\ntime_limit_s = 20.0\n[[phase]]\ntitle = \"Press\"\ninstructions = \"Press.\"\n\
+             [[criterion]]\nmeasure = \"time_s\"\npoor = 30.0\ngood = 20.0\n"
+        );
+        std::fs::write(folder.path().join(file), exercise).unwrap();
+        palpate(folder.path(), &["check", "liver", "--exercise", file])
+    };
+    let (status, text) = checked(21.0, "two.toml");
+    assert!(status == 0 && !text.contains("warning"), "{text}");
+    says(checked(20.0, "two.toml"), 0, &["phase 2 begins only if", "may take 20 s, and the time limit is 20 s"]);
+    says(checked(21.0, "other.toml"), 0, &["exercise two: its file is other.toml: a server leaves out"]);
 }
 
 /// A table of a press on a sheet, as the product simulates it.

@@ -102,6 +102,9 @@ pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
         ExerciseJudge::new(&chosen.exercise, chosen.lumps.clone(), &model, 0)?;
     }
     let script = arguments.script.as_ref().map(|path| find_script(path, &model.scene, &limits)).transpose()?;
+    if let Some(script) = &script {
+        exercise::phase_ends(script, chosen.as_ref())?;
+    }
     for warning in script.iter().flat_map(|script| &script.warnings) {
         say!("palpate: warning: {warning}");
     }

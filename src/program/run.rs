@@ -5,20 +5,17 @@ use std::path::PathBuf;
 
 use palpate_realtime::clock::now_ns;
 use palpate_session::Session;
-use palpate_session::chosen_exercise::ChosenExercise;
 use palpate_session::journal::exercise::ExerciseEvents;
-use palpate_session::phase_run::PhaseEnd;
 use palpate_session::run::{RunEvent, RunOptions, run_observed, write_event};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, StageTime, Summary, TopologyRecord};
-use palpate_tissue::scene::script::Script;
 
 use super::indent::{self, IndentArguments};
 use super::scene::SceneArguments;
-use super::score::exercise::{ExerciseOptions, compile, usual_thresholds, with_noticed_pressure};
-use super::score::{ScoreOptions, ScoreRecorder, ScoreSource};
-use super::{Failure, clock_s, say, with_progress};
+use super::score::exercise::{ExerciseOptions, compile, phase_ends, usual_thresholds, with_noticed_pressure};
+use super::score::{ScoreOptions, ScoreRecorder, ScoreSource, report};
+use super::{Failure, clock_s, say, with_progress, write_file};
 
 #[derive(clap::Args)]
 pub(crate) struct RunArguments {
@@ -52,6 +49,9 @@ pub(crate) struct RunArguments {
     /// (docs/exercises.md)
     #[arg(long, value_name = "FILE")]
     score: Option<PathBuf>,
+    /// Measure what the tools do, and write a report to print: one page with the force over time, a map of what was pressed, and each figure
+    #[arg(long, value_name = "FILE.html")]
+    report: Option<PathBuf>,
     #[command(flatten)]
     score_options: ScoreOptions,
     #[command(flatten)]
@@ -61,39 +61,25 @@ pub(crate) struct RunArguments {
     quiet: bool,
 }
 
-/// Returns where the trainee of a script ends phases of an exercise.
-///
-/// # Errors
-/// Refuses a phase that the exercise does not have.
-fn phase_ends(script: &Script, chosen: Option<&ChosenExercise>) -> Result<Vec<PhaseEnd>, Failure> {
-    let Some(chosen) = chosen else { return Ok(Vec::new()) };
-    let phases = chosen.exercise.phases.len();
-    if let Some((index, (_, phase))) = script.phase_ends.iter().enumerate().find(|(_, end)| end.1 as usize > phases) {
-        let message =
-            format!("phase_end[{index}].phase: {phase}: the exercise `{}` has {phases} phases", chosen.exercise.name);
-        return Err(Failure::Refused(message));
-    }
-    Ok(script.phase_ends.iter().map(|(step, phase)| PhaseEnd { phase: *phase, step: *step }).collect())
-}
-
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
     let (model, limits) = compile(chosen.as_ref(), &arguments.scene)?;
     let chosen = with_noticed_pressure(chosen, &model, &limits)?;
     let options = arguments.score_options.checked(usual_thresholds(chosen.as_ref()))?;
-    if let (None, Some(option)) = (&arguments.score, arguments.score_options.given()) {
-        return Err(Failure::Refused(format!("{option}: goes with --score FILE alone")));
-    }
-    if let (None, Some(_)) = (&arguments.score, &chosen) {
-        return Err(Failure::Refused(
-            "--exercise: goes with --score FILE alone: without it nothing is judged".to_owned(),
-        ));
+    let measured = [("--score", &arguments.score), ("--report", &arguments.report)];
+    let measured = measured.into_iter().find(|(_, file)| file.is_some()).map(|(option, _)| option);
+    if measured.is_none() {
+        let of_exercise = chosen.as_ref().map(|_| "--exercise");
+        if let Some(option) = arguments.score_options.given().or(of_exercise) {
+            let message =
+                format!("{option}: goes with --score FILE or --report FILE alone: without them nothing is measured");
+            return Err(Failure::Refused(message));
+        }
     }
     if arguments.script.as_os_str() == indent::NAME {
-        if arguments.score.is_some() {
-            let message = format!("--score: goes with a script, not with `{}`", indent::NAME);
-            return Err(Failure::Refused(message));
+        if let Some(option) = measured {
+            return Err(Failure::Refused(format!("{option}: goes with a script, not with `{}`", indent::NAME)));
         }
         return indent::run(&arguments.indent, &model, &limits, arguments.output.as_deref(), arguments.quiet);
     }
@@ -102,13 +88,12 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     for warning in model.warnings.iter().chain(&script.warnings) {
         say!("palpate: warning: {warning}");
     }
-    let mut recorder = match &arguments.score {
-        Some(_) => {
-            let continuous = (!arguments.held).then_some(&script);
-            let events = ExerciseEvents { phase_ends: phase_ends(&script, chosen.as_ref())?, result: None };
-            Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), events))?)
-        }
-        None => None,
+    let mut recorder = if measured.is_some() {
+        let continuous = (!arguments.held).then_some(&script);
+        let events = ExerciseEvents { phase_ends: phase_ends(&script, chosen.as_ref())?, result: None };
+        Some(ScoreRecorder::new(&model, 0, options, continuous, (chosen.as_ref(), events))?)
+    } else {
+        None
     };
     let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
     let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
@@ -131,12 +116,20 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         Err(SimulationFailure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         Err(failure) => Err(failure.into()),
         Ok(summary) => {
-            if let (Some(path), Some(recorder)) = (&arguments.score, recorder) {
+            let mut table = String::new();
+            if let Some(recorder) = recorder {
                 let (scene, script) = (model.scene.name.clone(), Some(script.name.clone()));
                 let source = ScoreSource { scene, script, ..ScoreSource::default() };
-                recorder.into_score(source, model.scene.stepping.rate_hz).0.write(path)?;
+                let (score, measures) = recorder.into_score(source, model.scene.stepping.rate_hz);
+                if let Some(path) = &arguments.score {
+                    score.write(path)?;
+                }
+                if let Some(path) = &arguments.report {
+                    write_file(path, report::page(&score, &measures)?.as_bytes())?;
+                }
+                table = score.table();
             }
-            tell(arguments, &summary);
+            tell(arguments, &summary, &table);
             for warning in &summary.warnings {
                 say!("palpate: warning: {warning}");
             }
@@ -145,9 +138,9 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     }
 }
 
-/// Prints the plot and the summary on the output that the records do not use. Without a file for the records, the
-/// summary is printed only on a terminal, not to a program that reads the records.
-fn tell(arguments: &RunArguments, summary: &Summary) {
+/// Prints the plot, the summary and the table of the score on the output that the records do not use. Without a file for the records, summary
+/// and table are printed only on a terminal, not to a program that reads the records.
+fn tell(arguments: &RunArguments, summary: &Summary, table: &str) {
     let to_file = arguments.output.is_some();
     let mut text = if arguments.plot { format!("{}\n", summary.curves) } else { String::new() };
     if !arguments.quiet && (to_file || std::io::stderr().is_terminal()) {
@@ -168,6 +161,7 @@ fn tell(arguments: &RunArguments, summary: &Summary) {
             let (share, name) = (100.0 * time_s / all_s, format!("stage {stage}"));
             text += &format!("{name:<28}{:.2} ms, {share:.1} %\n", 1e3 * time_s);
         }
+        text += table;
     }
     // A closed output does not end the program.
     let _ = if to_file {

@@ -69,7 +69,8 @@ impl ChosenExercise {
         self.exercise.assignments(&self.lumps)
     }
 
-    /// Returns what is doubtful about the hidden lumps in a tissue: each that it can hardly show, as a sentence.
+    /// Returns what is doubtful about the exercise in a tissue, as sentences: each hidden lump that it can hardly show, and a phase for which
+    /// the time limit leaves no time.
     pub fn warnings(&self, model: &Model) -> Vec<String> {
         let edge_m = model.shape().edge_m();
         let doubt = |(index, lump): (usize, &Lump)| {
@@ -90,7 +91,26 @@ impl ChosenExercise {
                 self.seed
             ))
         };
-        self.lumps.iter().enumerate().filter_map(doubt).collect()
+        self.lumps.iter().enumerate().filter_map(doubt).chain(self.phase_without_time()).collect()
+    }
+
+    /// Tells the first phase that begins only if the trainee ends those before it early, because these may take all of the exercise's time.
+    fn phase_without_time(&self) -> Option<String> {
+        let Exercise { name, phases, time_limit_s, .. } = &self.exercise;
+        let limit_s = (*time_limit_s)?;
+        let mut begins_s = 0.0;
+        for (index, phase) in phases.iter().enumerate() {
+            if begins_s >= limit_s {
+                return Some(format!(
+                    "exercise {name}: phase {} begins only if the trainee ends those before it early: they may take {begins_s} s, and the \
+                     time limit is {limit_s} s",
+                    index + 1
+                ));
+            }
+            // Without a limit of its own, the trainee ends it.
+            begins_s += phase.time_limit_s?;
+        }
+        None
     }
 
     /// Refuses an exercise or a seed that another one contradicts, which is that of the journal `place`.

@@ -251,7 +251,7 @@ fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
 /// most of them stay away, and those that do not share the force.
 #[allow(clippy::cast_precision_loss)]
 fn tips(shape: &dyn RestShape, script: &Script, laws: &mut Laws<'_>) -> Vec<TipUse> {
-    let first = script.tools() - script.poses.len();
+    let first = script.first_tip().unwrap_or_default();
     let end_s = script.steps as f64 / script.rate_hz;
     let of = |(tool, profile): (usize, &PoseProfile)| TipUse { tool, meeting: meeting(shape, profile, end_s, laws) };
     (first..).zip(&script.poses).filter(|(_, profile)| profile.mounted.is_none()).map(of).collect()

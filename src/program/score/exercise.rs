@@ -11,11 +11,13 @@ use palpate_session::exercise_judge::{EarnedCriterion, ExerciseJudge, ExerciseSc
 use palpate_session::felt_lump;
 use palpate_session::journal::exercise::from_header;
 use palpate_session::measured_run::MomentFigures;
+use palpate_session::phase_run::PhaseEnd;
 use palpate_session::{RecordedMark, Session};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::exercise::{ExercisePhase, Lump};
 use palpate_tissue::scene::exercise_reader::find_exercise;
+use palpate_tissue::scene::script::Script;
 use palpate_tissue::select::scheme_selection::NEVER;
 use serde::{Deserialize, Serialize};
 
@@ -43,7 +45,15 @@ impl ExerciseOptions {
     pub(crate) fn chosen(&self) -> Result<Option<ChosenExercise>, Refusal> {
         let Some(path) = &self.exercise else { return Ok(None) };
         let (name, text) = find_exercise(path, &Limits::default())?;
-        ChosenExercise::new(&name, &text, self.seed).map(Some).map_err(of_option)
+        let chosen = ChosenExercise::new(&name, &text, self.seed).map_err(of_option)?;
+        let (named, file) = (&chosen.exercise.name, path.file_stem().unwrap_or_default());
+        if file != named.as_str() {
+            say!(
+                "palpate: warning: exercise {named}: its file is {}: a server leaves out an exercise whose file is named otherwise",
+                path.display()
+            );
+        }
+        Ok(Some(chosen))
     }
 
     /// Returns the exercise of a recorded session: that of its journal, if the session was made for one, or else the one that was given.
@@ -99,19 +109,45 @@ pub(crate) fn compile(
 ) -> Result<(Arc<Model>, Limits), Failure> {
     let Some(chosen) = chosen else { return compile_with(scene, &[]) };
     let of_exercise = |failure: Failure| match failure {
+        // The lumps that were drawn are in the scene's text: they are not the user's `--set`.
         Failure::Refused(message) if message.contains("inclusion") => {
-            // The lumps that were drawn are in the scene's text: they are not the user's `--set`.
-            let message = message.replace("--set: ", "");
-            Failure::Refused(format!(
-                "exercise {}: a lump of seed {} does not fit this scene: {message}",
-                chosen.exercise.name, chosen.seed
-            ))
+            Failure::Refused(misfit(chosen, &message.replace("--set: ", "")))
         }
         other => other,
     };
     let compiled = compile_with(scene, &chosen.assignments()).map_err(of_exercise)?;
     warn(chosen, &compiled.0);
     Ok(compiled)
+}
+
+/// Returns the refusal of a scene in which the exercise's lumps are the inclusions, for those who wrote the exercise.
+fn misfit(chosen: &ChosenExercise, message: &str) -> String {
+    let (name, seed) = (&chosen.exercise.name, chosen.seed);
+    let number = message.split_once("inclusion[").and_then(|(_, rest)| rest.split_once(']'));
+    let number = number.and_then(|(number, _)| number.parse::<usize>().ok());
+    match number.and_then(|number| Some((number + 1, chosen.lumps.get(number)?.centre_m))) {
+        Some((number, at_m)) => format!(
+            "exercise {name}: lump {number} of seed {seed}, at [{:.4}, {:.4}, {:.4}] m, does not fit this scene: {message}; from_m and \
+             to_m of [lumps] are the box of the places",
+            at_m[0], at_m[1], at_m[2]
+        ),
+        None => format!("exercise {name}: a lump of seed {seed} does not fit this scene: {message}"),
+    }
+}
+
+/// Returns where the trainee of a script ends phases of an exercise.
+///
+/// # Errors
+/// Refuses a phase that the exercise does not have.
+pub(crate) fn phase_ends(script: &Script, chosen: Option<&ChosenExercise>) -> Result<Vec<PhaseEnd>, Failure> {
+    let Some(chosen) = chosen else { return Ok(Vec::new()) };
+    let phases = chosen.exercise.phases.len();
+    if let Some((index, (_, phase))) = script.phase_ends.iter().enumerate().find(|(_, end)| end.1 as usize > phases) {
+        let message =
+            format!("phase_end[{index}].phase: {phase}: the exercise `{}` has {phases} phases", chosen.exercise.name);
+        return Err(Failure::Refused(message));
+    }
+    Ok(script.phase_ends.iter().map(|(step, phase)| PhaseEnd { phase: *phase, step: *step }).collect())
 }
 
 /// Warns if the exercise is made for other scenes than that of the tissue, and if this can hardly show the hidden lumps.
