@@ -29,6 +29,8 @@ export interface ExerciseHost {
   again: () => void;
   /** Copies the address with which a trainee opens the session. */
   share: (traineeId: string) => void;
+  /** Shows what was hidden. */
+  reveal: (lumps: readonly Lump[]) => void;
   notice: (text: string, seconds?: number) => void;
 }
 
@@ -307,6 +309,8 @@ export class ExercisePanel {
     if (this.result) return;
     this.result = result;
     this.drop();
+    const hidden = hiddenIn(result);
+    if (hidden.length > 0) this.host.reveal(hidden);
     this.draw();
     this.heard();
     this.tellResult();
@@ -317,11 +321,9 @@ export class ExercisePanel {
     if (this.result) this.debriefing.show(excerpt(exercise?.title || exercise?.name || ""), this.result, exercise?.phases ?? []);
   }
 
-  /** Draws answers and markers on the tissue, and what was hidden once that is told. */
+  /** Draws answers and markers on the tissue. */
   private draw(): void {
     const { result } = this;
-    // A trainer sees the lumps of the scene, and now also those that were hidden since.
-    if (result) this.stage.setLumps(hiddenIn(result));
     this.stage.setMarks([...(result?.isTold ? markedIn(result) : this.answers), ...this.markers]);
   }
 }

@@ -1,4 +1,5 @@
-// Lumps: the stiff parts of a scene, shown to an instructor, and lumps that the user adds to an uploaded mesh.
+// Lumps: the stiff parts of a scene, shown to an instructor, those that the result of an exercise reveals, and lumps that the user adds to
+// an uploaded mesh.
 
 import { create } from "@bufbuild/protobuf";
 import type { Vec3 } from "palpate";
@@ -66,6 +67,10 @@ export class Lumps {
   private readonly box = part("lumps", HTMLInputElement);
   private readonly put = part("put-lump", HTMLButtonElement);
   private readonly take = part("take-lumps", HTMLButtonElement);
+  /** The lumps of the shown session's scene. */
+  private known: Lump[] = [];
+  /** What was hidden, once a result tells it. It is shown until the instructor uses the box. */
+  private revealed: readonly Lump[] | undefined;
 
   constructor(
     private readonly stage: Stage,
@@ -73,8 +78,8 @@ export class Lumps {
     private readonly host: Host,
   ) {
     this.box.addEventListener("change", () => {
-      const shownSession = host.present();
-      if (shownSession) this.show(shownSession.session);
+      this.revealed = undefined;
+      this.draw();
     });
     this.put.addEventListener("click", () => this.place(this.input.onPlace === undefined));
     this.take.addEventListener("click", () => void this.change());
@@ -82,12 +87,30 @@ export class Lumps {
 
   /** Shows the lumps of a session, if the instructor wants that, and the controls to change them. */
   show({ scene }: Session): void {
-    const lumps = lumpsOf(scene);
-    part("lumps-shown", HTMLElement).hidden = lumps.length === 0;
+    this.revealed = undefined;
+    this.known = lumpsOf(scene);
     part("own-lumps", HTMLElement).hidden = this.host.scene() === undefined;
-    this.take.hidden = lumps.length === 0;
-    this.stage.setLumps(this.box.checked ? lumps : []);
+    this.draw();
     if (this.input.onPlace) this.place(false);
+  }
+
+  /** Takes a new status of the session: a trainer may have hidden another lump. Lumps are only ever added to a session. */
+  heard({ scene }: Session): void {
+    const lumps = lumpsOf(scene);
+    if (lumps.length === this.known.length) return;
+    this.known = lumps;
+    this.draw();
+  }
+
+  /** Shows what was hidden, whether the instructor wants that or not. */
+  reveal(lumps: readonly Lump[]): void {
+    this.revealed = lumps;
+    this.draw();
+  }
+
+  private draw(): void {
+    for (const each of [part("lumps-shown", HTMLElement), this.take]) each.hidden = this.known.length === 0;
+    this.stage.setLumps(this.revealed ?? (this.box.checked ? this.known : []));
   }
 
   /** With `on`, the next press on the tissue adds a lump; otherwise presses touch again. */

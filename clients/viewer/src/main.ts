@@ -133,6 +133,7 @@ const exercise = new ExercisePanel(stage, input, {
     const name = shownSession?.session.exercise?.exercise?.name;
     if (name !== undefined) void open({ source: forExercise(name), isNew: true });
   },
+  reveal: (hidden) => lumps.reveal(hidden),
   share: (traineeId) => copy(withSession(traineeId), "Link copied. Who opens it does the exercise, and gets nothing that it hides."),
   notice,
 });
@@ -436,6 +437,7 @@ function heard(session: Session): void {
   if (session.sessionId !== shownSession?.session.sessionId) return;
   shownSession.session = session;
   player.heard(session);
+  lumps.heard(session);
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
   tellUndo(shownSession);

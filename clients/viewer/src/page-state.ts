@@ -36,6 +36,10 @@ export function pageState(present: () => ShownSession | undefined, { stage, play
     get exercise() {
       return exercise.state;
     },
+    /** Number of lumps that are drawn. */
+    get lumps() {
+      return stage.lumpCount;
+    },
     get received() {
       return received.bytes;
     },

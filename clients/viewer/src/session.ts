@@ -5,7 +5,7 @@ import { Burning } from "./burning";
 import { fingerM } from "./coefficients";
 import { isBarred } from "./token-form";
 import { fetchMesh, followWound, Frames, type FrameTold, type MeshData, norm, plus, type Vec3, Wound } from "palpate";
-import { type Session, TipShape } from "palpate/v1";
+import { ExerciseRole, type Session, TipShape } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { Hands } from "./hands";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
@@ -16,6 +16,8 @@ import { VersionFollower } from "./version-follower";
 
 /** Interval between two requests for the session's status. */
 const ASK_MS = 1000;
+/** The same for the trainer of an exercise, who is to see at once what is hidden while it goes on. */
+const TRAINER_ASK_MS = 500;
 
 /** The default refinement has at most this many vertices; the user may select more. */
 const CHOSEN_VERTICES = 40_000;
@@ -372,7 +374,7 @@ export class ShownSession {
           const ended = performance.now();
           alive();
           if (session) this.heard(session, begun, ended);
-          await sleep(ASK_MS, signal);
+          await sleep(this.session.exercise?.role === ExerciseRole.TRAINER ? TRAINER_ASK_MS : ASK_MS, signal);
         }
       },
       this.asking.signal,

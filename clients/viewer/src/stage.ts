@@ -258,6 +258,11 @@ export class Stage {
     this.lumps = this.exchange(this.lumps, lumps, this.lumpy);
   }
 
+  /** Number of lumps that are shown. */
+  get lumpCount(): number {
+    return this.lumps.length;
+  }
+
   /** Shows places that were marked. */
   setMarks(marks: readonly Lump[]): void {
     this.markedBalls = this.exchange(this.markedBalls, marks, this.marked);

@@ -117,12 +117,29 @@ describe("an exercise", () => {
     assert.match((await looking.text("exercise-score")) ?? "", /\d+ %|none/);
     await looking.picture("exercise-trainer");
     await trainer.screenshot({ path: "../../target/viewer/exercise-trainees.png" });
+    // Another lump is on that page as soon as it is in the tissue, and a press that was asked for is still taken as such.
+    const before = await looking.ask(({ lumps }) => lumps);
+    assert.ok(before >= 1);
+    await looking.page.click("#point-out");
     await row.getByText("Another lump").click();
     await trainer.locator("#said").getByText(/Ada has another lump, 1[0-6] mm wide/).waitFor();
-    assert.equal((await trainee.ask(({ exercise }) => exercise)).advised, 2);
+    await looking.until(({ lumps }, before) => lumps === before + 1, before);
+    assert.equal(await looking.page.getAttribute("#point-out", "aria-pressed"), "true");
+    await looking.page.click("#point-out");
+    await looking.picture("exercise-another-lump");
+    // Who does not want to see lumps sees none before the end.
+    await looking.page.uncheck("#lumps", { force: true });
+    await looking.until(({ lumps }) => lumps === 0);
+    // The trainee's page knows of no lump.
+    const { exercise, lumps, sampledS } = await trainee.ask(({ exercise, lumps, sampledS }) => ({ exercise, lumps, sampledS }));
+    assert.deepEqual([exercise.advised, lumps], [2, 0]);
+    await trainee.until(({ sampledS }, before) => sampledS > before + 2, sampledS);
+    assert.equal(await trainee.ask(({ lumps }) => lumps), 0);
     await row.getByText("Finish").click();
     await trainee.until(({ exercise }) => exercise.finished && exercise.isDebriefing);
-    assert.ok((await trainee.ask(({ exercise }) => exercise)).lumpsTold >= 2, "one at least from the beginning, and another one");
+    const told = (await trainee.ask(({ exercise }) => exercise)).lumpsTold;
+    assert.equal(told, before + 1, "those from the beginning, and another one");
+    for (const page of [trainee, looking]) await page.until(({ exercise, lumps }, told) => exercise.finished && lumps === told, told);
     await row.getByText(/Finished after/).waitFor();
     await row.getByText("Another lump").waitFor({ state: "hidden" });
     assert.deepEqual([...trainee.complaints, ...looking.complaints], []);

@@ -275,7 +275,7 @@ export class Server {
  *   takeLongest: () => { pictureMs: number, woundMs: number },
  *   comparison: { isOpen: boolean, curves: number, relativeRms: number },
  *   exercise: { isShown: boolean, isTrainee: boolean, isBriefing: boolean, isDebriefing: boolean, answers: number, phase: number, advised: number, finished: boolean, lumpsTold: number, scorePercent: number | undefined },
- *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>, thumbnail: () => string,
+ *   lumps: number, ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>, thumbnail: () => string,
  * }} Inside State that the page exposes for tests (src/main.ts).
  */
 
