@@ -682,6 +682,38 @@ fn purpose(text: &str) -> Option<String> {
     end.map(|(at, _)| paragraph[..=at].to_owned())
 }
 
+/// The names of test programs are written down, so a file that no program has is never compiled.
+#[test]
+fn every_file_of_tests_belongs_to_a_program() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for (package, folder) in
+        [(root.to_owned(), root.join("tests")), (root.join("tests/server"), root.join("tests/server"))]
+    {
+        let manifest = std::fs::read_to_string(package.join("Cargo.toml")).unwrap();
+        let programs: Vec<PathBuf> = manifest
+            .split("path = \"")
+            .skip(1)
+            .filter_map(|rest| rest.split('"').next())
+            .map(|path| package.join(path))
+            .filter(|path| path.starts_with(&folder))
+            .collect();
+        assert!(programs.len() > 2 && programs.iter().all(|path| path.is_file()), "{programs:?}");
+        let texts: Vec<String> = programs.iter().map(|path| std::fs::read_to_string(path).unwrap()).collect();
+        for entry in std::fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            let main = path.join("main.rs");
+            let (file, is_file) = if main.is_file() {
+                (main, true)
+            } else {
+                (path.clone(), path.extension().is_some_and(|end| end == "rs"))
+            };
+            let module = format!("mod {};", path.file_stem().unwrap().to_string_lossy());
+            let has = programs.contains(&file) || texts.iter().any(|text| text.contains(&module));
+            assert!(!is_file || has, "{} belongs to no program of {}", path.display(), package.display());
+        }
+    }
+}
+
 #[test]
 fn every_file_begins_with_what_it_is_for() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
