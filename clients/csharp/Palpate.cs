@@ -331,6 +331,7 @@ namespace Palpate
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_change(IntPtr session, ref Change change);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_delete(IntPtr session);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_status_of(IntPtr session, out Status status);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_severed_anchors(IntPtr session, out uint count);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_tie_options_init(out TieOptions options, UIntPtr size);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_thread(IntPtr session, uint number, ref TieOptions options);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_clip(IntPtr session, uint number, ref TieOptions options);
@@ -360,6 +361,7 @@ namespace Palpate
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_indices(IntPtr surface, int[] indices, UIntPtr capacity);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_uv(IntPtr surface, float[] uv, UIntPtr stride, UIntPtr vertices);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_read(IntPtr surface, ref Buffers buffers, out Dirty dirty);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_burns(IntPtr surface, [Out] float[] burns, UIntPtr stride, UIntPtr vertices, out uint version);
         [DllImport(Library, CallingConvention = C)] internal static extern void palpate_surface_free(IntPtr surface);
 
         internal static void Check(Code code)
@@ -543,6 +545,12 @@ namespace Palpate
         public Status Status
         {
             get { Status status; Native.Check(Native.palpate_session_status_of(Pointer, out status)); return status; }
+        }
+
+        /// <summary>Number of severed anchor springs. Waits for the server.</summary>
+        public uint SeveredAnchors
+        {
+            get { uint count; Native.Check(Native.palpate_session_severed_anchors(Pointer, out count)); return count; }
         }
 
         /// <summary>Lays a thread through bites, or changes one that has these bites; see palpate_session_thread. Waits for the
@@ -790,6 +798,9 @@ namespace Palpate
         public readonly int[] Indices;
         /// <summary>u, v of each vertex; null if the mesh has no texture coordinates.</summary>
         public readonly float[] Uv;
+        /// <summary>How burnt each vertex is by cautery, 0 to 1, as of the last ReadBurns; see palpate_surface_burns.</summary>
+        public readonly float[] Burns;
+        uint burnVersion;
         /// <summary>Whether the surface will receive no more updates.</summary>
         public bool IsLost { get; private set; }
         bool isRead;
@@ -806,6 +817,7 @@ namespace Palpate
             Native.Check(Native.palpate_surface_size_of(Pointer, out size));
             Positions = new float[3 * (int)size.Vertices];
             Normals = new float[Positions.Length];
+            Burns = new float[(int)size.Vertices];
             Indices = new int[(int)size.Indices];
             Native.Check(Native.palpate_surface_indices(Pointer, Indices, size.Indices));
             if (size.HasUv == 0) return;
@@ -833,6 +845,16 @@ namespace Palpate
                 return dirty;
             }
             finally { positions.Free(); normals.Free(); }
+        }
+
+        /// <summary>Updates how burnt each vertex is, and returns whether that has changed. Never waits.</summary>
+        public bool ReadBurns()
+        {
+            uint version;
+            Native.Check(Native.palpate_surface_burns(Pointer, null, UIntPtr.Zero, UIntPtr.Zero, out version));
+            if (version == burnVersion) return false;
+            Native.Check(Native.palpate_surface_burns(Pointer, Burns, (UIntPtr)4, (UIntPtr)Burns.Length, out burnVersion));
+            return true;
         }
 
         internal override void Free(IntPtr pointer) { Native.palpate_surface_free(pointer); }

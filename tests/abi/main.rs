@@ -117,13 +117,28 @@ fn assert_both_hands_felt(output: &Output, min_torque_n_m: f64) {
     }
 }
 
-/// Checks the output of an example that cuts liver along 30 mm, twelve springs of 2.5 mm, and sews it by a thread of 20 mm.
-fn assert_sewn(output: &Output) {
-    let told = told(output);
+/// A folder with the scene `liver`, whose anchor springs can be severed here.
+fn anchored_liver() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let liver = std::fs::read_to_string(root().join("scenes/liver.toml")).unwrap();
+    let anchored = liver.replace("[cutting]", "[cutting]\nanchor_depth_m = 0.003\n#");
+    assert_ne!(anchored, liver);
+    std::fs::write(folder.path().join("liver.toml"), anchored).unwrap();
+    folder
+}
+
+/// Checks an example that cuts liver along 30 mm, twelve springs of 2.5 mm, sews it by a thread of 20 mm, and burns a place through.
+fn assert_cuts_sews_and_burns(program: &mut Command) {
+    let scenes = anchored_liver();
+    let server = TestServer::start(&["--scenes", scenes.path().to_str().unwrap()]);
+    let told = told(&done(program.args([server.url.as_str(), "liver"])));
     assert!(told["severed"].as_u64().unwrap() >= 24 && told["pieces"].as_u64() == Some(1), "{told}");
     assert!(told["version"].as_u64().unwrap() > 1, "{told}");
     let (thread_m, tension_n) = (told["thread_m"].as_f64().unwrap(), told["tension_n"].as_f64().unwrap());
     assert!((0.019..0.021).contains(&thread_m) && tension_n > 1e-3, "{told}");
+    // A disc of 3 mm reaches some of the points, which are 2.5 mm apart, and with each its anchor goes.
+    let (burnt, anchors) = (told["burnt"].as_u64().unwrap(), told["anchors"].as_u64().unwrap());
+    assert!((1..=16).contains(&burnt) && anchors >= burnt, "{told}");
 }
 
 const RUN: [&str; 2] = ["liver", "2"];
@@ -148,7 +163,7 @@ async fn examples_in_c_press_look_and_connect_a_device() {
     assert!(["real time", "refused"].contains(&told["priority"].as_str().unwrap()), "{told}");
     let hands = compiled("clients/c/examples/hands.c", &[]);
     assert_both_hands_felt(&done(ours(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 1e-4);
-    assert_sewn(&done(ours(&compiled("clients/c/examples/cut.c", &[])).arg(&server.url).arg("liver")));
+    assert_cuts_sews_and_burns(&mut ours(&compiled("clients/c/examples/cut.c", &[])));
     // Wrong names end with a message and a status.
     for (url, scene) in [("http://127.0.0.1:1", "liver"), (server.url.as_str(), "nowhere")] {
         let refused = ours(&touch).args([url, scene, "1"]).output().unwrap();
@@ -192,7 +207,7 @@ async fn examples_in_cpp_press_look_and_show() {
     // In a port only the turn about the shaft is felt as a torque.
     let hands = compiled("clients/cpp/examples/hands.cpp", &[]);
     assert_both_hands_felt(&done(ours(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 0.0);
-    assert_sewn(&done(ours(&compiled("clients/cpp/examples/cut.cpp", &[])).arg(&server.url).arg("liver")));
+    assert_cuts_sews_and_burns(&mut ours(&compiled("clients/cpp/examples/cut.cpp", &[])));
     // The others by the CMake package, where there is CMake.
     let built = folder().join("cmake");
     let program = |name: &str| built.join(name);
@@ -243,7 +258,7 @@ async fn examples_in_cs_press_look_and_show() {
     assert_pressed(&run(&compiled_cs("clients/csharp/examples/FrontEnd.cs")), false);
     let hands = compiled_cs("clients/csharp/examples/Hands.cs");
     assert_both_hands_felt(&done(mono(&hands).arg(&server.url).args(RUN_UNTIL_FELT)), 1e-4);
-    assert_sewn(&done(mono(&compiled_cs("clients/csharp/examples/Cut.cs")).arg(&server.url).arg("liver")));
+    assert_cuts_sews_and_burns(&mut mono(&compiled_cs("clients/csharp/examples/Cut.cs")));
     done(mono(&compiled_cs("clients/csharp/tests/Errors.cs")).arg(&server.url));
 }
 

@@ -1165,6 +1165,13 @@ enum palpate_result palpate_session_status_of(const struct palpate_session *sess
                                               struct palpate_session_status *status);
 
 /**
+ * Writes how many of the severed springs (`palpate_session_status.severed`) are anchor springs: blades and heat sever those of a scene with
+ * `anchor_depth_m`. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_severed_anchors(const struct palpate_session *session,
+                                                    uint32_t *count);
+
+/**
  * Initializes a change so that it changes nothing. Any thread.
  */
 enum palpate_result palpate_change_init(struct palpate_change *change);
@@ -1226,6 +1233,18 @@ enum palpate_result palpate_surface_uv(const struct palpate_surface *surface,
 enum palpate_result palpate_surface_read(const struct palpate_surface *surface,
                                          const struct palpate_buffers *buffers,
                                          struct palpate_dirty *dirty);
+
+/**
+ * Writes how burnt each vertex is by cautery (`palpate_touch_options.burn_s`): the time of contact divided by that in which it burns through,
+ * 0 to 1. The values are `stride` bytes (4 or more) apart. Writes into `version` the version of what is burnt: 0 before anything is, and
+ * larger after each change; one of both pointers may be null. Burns come a round trip after the frame that shows the tissue of their moment. Returns
+ * `PALPATE_BUFFER` if `vertices`, for which there is room, is below that of the surface. One thread at a time. Never waits.
+ */
+enum palpate_result palpate_surface_burns(const struct palpate_surface *surface,
+                                          float *burns,
+                                          size_t stride,
+                                          size_t vertices,
+                                          uint32_t *version);
 
 /**
  * Frees a handle. Null is allowed. Any thread, once, when no other thread is in a function of this handle.

@@ -488,6 +488,21 @@ pub unsafe extern "C" fn palpate_session_status_of(
     })
 }
 
+/// Writes how many of the severed springs (`palpate_session_status.severed`) are anchor springs: blades and heat sever those of a scene with
+/// `anchor_depth_m`. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_severed_anchors(
+    session: *const palpate_session,
+    count: *mut u32,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, count) = unsafe { (at(session, "session is null")?, at_mut(count, "count is null")?) };
+        *count = session.get()?.severed_anchors;
+        Ok(())
+    })
+}
+
 /// Initializes a change so that it changes nothing. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> palpate_result {

@@ -246,6 +246,46 @@ pub unsafe extern "C" fn palpate_surface_read(
     })
 }
 
+/// Writes how burnt each vertex is by cautery (`palpate_touch_options.burn_s`): the time of contact divided by that in which it burns through,
+/// 0 to 1. The values are `stride` bytes (4 or more) apart. Writes into `version` the version of what is burnt: 0 before anything is, and
+/// larger after each change; one of both pointers may be null. Burns come a round trip after the frame that shows the tissue of their moment. Returns
+/// `PALPATE_BUFFER` if `vertices`, for which there is room, is below that of the surface. One thread at a time. Never waits.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_burns(
+    surface: *const palpate_surface,
+    burns: *mut f32,
+    stride: usize,
+    vertices: usize,
+    version: *mut u32,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let surface = unsafe { at(surface, "surface is null") }?;
+        if burns.is_null() && version.is_null() {
+            return Err(CodedError::argument("burns and version are null"));
+        }
+        if !burns.is_null() && stride < 4 {
+            return Err(CodedError::argument("stride must be 4 bytes or more"));
+        }
+        if !burns.is_null() && vertices < surface.vertices {
+            return Err(CodedError::new(PALPATE_BUFFER, format!("the surface has {} vertices", surface.vertices)));
+        }
+        surface.seen.with(|seen| {
+            let newest = seen.shown.burns();
+            if !version.is_null() {
+                // SAFETY: the caller's promise.
+                unsafe { version.write(newest.version) };
+            }
+            if !burns.is_null() {
+                for (k, burn) in newest.burn.iter().enumerate() {
+                    // SAFETY: it fits.
+                    unsafe { burns.cast::<u8>().add(stride * k).cast::<f32>().write_unaligned(*burn) };
+                }
+            }
+        })
+    })
+}
+
 impl SurfaceObservation {
     /// Takes the newest moment; returns which vertices to write.
     fn take(&mut self, everything: bool) -> palpate_dirty {

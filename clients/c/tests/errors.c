@@ -246,6 +246,8 @@ int main(int count, char **arguments) {
     EXPECT(palpate_surface_size_of(NULL, NULL), PALPATE_ARGUMENT, "surface is null");
     EXPECT(palpate_surface_indices(NULL, NULL, 0), PALPATE_ARGUMENT, "surface is null");
     EXPECT(palpate_surface_uv(NULL, NULL, 8, 0), PALPATE_ARGUMENT, "surface is null");
+    EXPECT(palpate_surface_burns(NULL, NULL, 4, 0, NULL), PALPATE_ARGUMENT, "surface is null");
+    EXPECT(palpate_session_severed_anchors(NULL, NULL), PALPATE_ARGUMENT, "session is null");
     EXPECT(palpate_touch_options_init(NULL, 8), PALPATE_ARGUMENT, "options is null");
     EXPECT(palpate_change_init(NULL), PALPATE_ARGUMENT, "change is null");
     palpate_touch_options unknown;
@@ -366,6 +368,10 @@ int main(int count, char **arguments) {
     palpate_session_status status;
     EXPECT(palpate_session_status_of(session, &status), PALPATE_OK, NULL);
     if (status.pieces != 1 || status.severed != 0) failures++, fprintf(stderr, "%u pieces\n", status.pieces);
+    EXPECT(palpate_session_severed_anchors(session, NULL), PALPATE_ARGUMENT, "count is null");
+    uint32_t anchors = 9;
+    EXPECT(palpate_session_severed_anchors(session, &anchors), PALPATE_OK, NULL);
+    if (anchors != 0) failures++, fprintf(stderr, "%u anchors\n", anchors);
 
     /* Touch. */
     palpate_touch_options options;
@@ -438,6 +444,19 @@ int main(int count, char **arguments) {
     buffers.vertices++;
     EXPECT(palpate_surface_read(surface, &buffers, &dirty), PALPATE_OK, NULL);
     if (dirty.first != 0 || dirty.count != size.vertices) failures++, fprintf(stderr, "dirty %zu\n", dirty.count);
+    /* Nothing is burnt. */
+    uint32_t burn_version = 9;
+    float *burns = malloc(size.vertices * sizeof(float));
+    for (size_t k = 0; k < size.vertices; k++) burns[k] = 9.0f;
+    EXPECT(palpate_surface_burns(surface, NULL, 4, size.vertices, NULL), PALPATE_ARGUMENT, "null");
+    EXPECT(palpate_surface_burns(surface, burns, 3, size.vertices, &burn_version), PALPATE_ARGUMENT, "stride");
+    EXPECT(palpate_surface_burns(surface, burns, 4, size.vertices - 1, &burn_version), PALPATE_BUFFER, "vertices");
+    if (burn_version != 9) failures++, fprintf(stderr, "a version of burns that were refused\n");
+    EXPECT(palpate_surface_burns(surface, burns, 4, size.vertices, NULL), PALPATE_OK, NULL);
+    EXPECT(palpate_surface_burns(surface, NULL, 0, 0, &burn_version), PALPATE_OK, NULL);
+    for (size_t k = 0; k < size.vertices; k++) failures += burns[k] != 0.0f;
+    if (burn_version != 0) failures++, fprintf(stderr, "burns of version %u\n", burn_version);
+    free(burns);
     EXPECT(palpate_surface_indices(surface, indices, size.indices - 1), PALPATE_BUFFER, NULL);
     EXPECT(palpate_surface_indices(surface, indices, size.indices), PALPATE_OK, NULL);
     for (size_t k = 0; k < size.indices; k++) failures += indices[k] >= size.vertices;

@@ -1,5 +1,5 @@
-// Cuts a tissue and sews it: `cut URL SCENE`, for a sheet such as liver. A device of your own leads a blade; then a thread through
-// four places draws the lips of the cut together.
+// Cuts a tissue, sews it and burns it: `cut URL SCENE`, for a sheet such as liver. A device of your own leads a blade; then a thread
+// through four places draws the lips of the cut together; then a hot tip is held on a place until that has burnt through.
 #include <algorithm>
 #include <chrono>
 #include <cstdio>
@@ -19,6 +19,15 @@ struct Scalpel : palpate::Device {
         return true;
     }
     bool write(const palpate::Vector&) override { return true; }
+};
+
+/// A hot tip that stays 2 mm below the surface, beside the cut.
+struct Cautery : Scalpel {
+    bool read(palpate::Reading& reading) override {
+        reading.position = {0.02, 0.0, 0.002 - 0.004 * std::min(1e-3 * double(ticks++) / 0.5, 1.0)};
+        reading.enable = 1;
+        return true;
+    }
 };
 
 static int failed(const palpate::Error& error) { return std::fprintf(stderr, "%s\n", error.words.c_str()), 1; }
@@ -54,7 +63,24 @@ int main(int count, char** arguments) {
     auto status = session->status();
     if (!status) return failed(status.error());
     if (auto error = session->untie(0, 0)) return failed(*error);
-    std::printf("{\"severed\":%u,\"pieces\":%u,\"version\":%u,\"thread_m\":%.5f,\"tension_n\":%.4f}\n", status->severed,
-                status->pieces, status->topology_version, thread.path_m, thread.tension_n);
+
+    auto surface = session->surface();
+    if (!surface) return failed(surface.error());
+    palpate::TouchOptions heat;
+    heat.tip_radius_m = 0.003;
+    heat.burn_s = 0.3;
+    heat.tool = 1;  // the thread is by tool 0
+    Cautery cautery;
+    auto burning = session->bridge(cautery, heat);
+    if (!burning) return failed(burning.error());
+    long burnt = 0;
+    for (int look = 0; look < 6000 && burnt == 0; look++, wait())
+        if (surface->read_burns())
+            burnt = std::count_if(surface->burns().begin(), surface->burns().end(), [](float burn) { return burn >= 1.0f; });
+    if (auto report = burning->end(); !report) return failed(report.error());
+    auto anchors = session->severed_anchors();
+    if (!anchors) return failed(anchors.error());
+    std::printf("{\"severed\":%u,\"pieces\":%u,\"version\":%u,\"thread_m\":%.5f,\"tension_n\":%.4f,\"burnt\":%ld,\"anchors\":%u}\n",
+                status->severed, status->pieces, status->topology_version, thread.path_m, thread.tension_n, burnt, *anchors);
     session->remove();
 }

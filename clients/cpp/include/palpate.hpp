@@ -280,6 +280,14 @@ public:
         buffers_.everything = 0;
         return dirty;
     }
+    /// Returns how burnt each vertex is by cautery, 0 to 1, as of the last `read_burns`; see palpate_surface_burns.
+    const std::vector<float>& burns() const { return burns_; }
+    /// Updates how burnt each vertex is, and returns whether that has changed. Never waits.
+    bool read_burns() {
+        std::uint32_t version = 0;
+        if (palpate_surface_burns(surface_.get(), nullptr, 0, 0, &version) != PALPATE_OK || version == burn_version_) return false;
+        return palpate_surface_burns(surface_.get(), burns_.data(), sizeof(float), burns_.size(), &burn_version_) == PALPATE_OK;
+    }
     /// Returns whether the surface will receive no more updates.
     bool lost() const { return lost_; }
 
@@ -288,6 +296,7 @@ public:
         palpate_surface_size_of(surface, &size);
         positions_.resize(3 * size.vertices);
         normals_.resize(3 * size.vertices);
+        burns_.resize(size.vertices);
         indices_.resize(size.indices);
         palpate_surface_indices(surface, indices_.data(), indices_.size());
         if (size.has_uv) {
@@ -300,7 +309,8 @@ public:
 
 private:
     detail::Handle<palpate_surface, palpate_surface_free> surface_;
-    std::vector<float> positions_, normals_, uv_;
+    std::vector<float> positions_, normals_, uv_, burns_;
+    std::uint32_t burn_version_ = 0;
     std::vector<std::uint32_t> indices_;
     palpate_buffers buffers_{};
     bool lost_ = false;
@@ -358,6 +368,12 @@ public:
         Status status{};
         if (auto code = palpate_session_status_of(session_.get(), &status)) return detail::error(code);
         return status;
+    }
+    /// Returns how many anchor springs are severed. Waits for the server.
+    Result<std::uint32_t> severed_anchors() const {
+        std::uint32_t count = 0;
+        if (auto code = palpate_session_severed_anchors(session_.get(), &count)) return detail::error(code);
+        return count;
     }
     /// Lays a thread through bites, or changes one that has these bites; see palpate_session_thread. Waits for the server.
     std::optional<Error> thread(std::uint32_t number, const std::vector<Vector>& bites, double length_m,

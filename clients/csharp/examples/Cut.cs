@@ -1,7 +1,8 @@
-// Cuts a tissue and sews it: `Cut.exe URL SCENE`, for a sheet such as liver. A device of your own leads a blade; then a thread
-// through four places draws the lips of the cut together.
+// Cuts a tissue, sews it and burns it: `Cut.exe URL SCENE`, for a sheet such as liver. A device of your own leads a blade; then a thread
+// through four places draws the lips of the cut together; then a hot tip is held on a place until that has burnt through.
 using System;
 using System.Globalization;
+using System.Linq;
 using System.Threading;
 using Palpate;
 
@@ -18,6 +19,15 @@ class Scalpel : IDevice
     }
     public void Write(Vector force) { }
     static double Part(double value) { return Math.Max(0.0, Math.Min(1.0, value)); }
+}
+
+/// A hot tip that stays 2 mm below the surface, beside the cut.
+class Cautery : IDevice
+{
+    long ticks;
+    public Limits Limits { get { return Limits.Of("omega3"); } }
+    public Reading Read() { return new Reading(new Vector(0.02, 0.0, 0.002 - 0.004 * Math.Min(1e-3 * ticks++ / 0.5, 1.0)), true); }
+    public void Write(Vector force) { }
 }
 
 static class Cut
@@ -46,9 +56,22 @@ static class Cut
                 foreach (Tie tie in session.Ties) thread = tie;
             Status status = session.Status;
             session.Untie(0, 0);
+
+            var heat = TouchOptions.Default;
+            heat.TipRadius = 0.003;
+            heat.Burn = 0.3;
+            heat.Tool = 1;
+            int burnt = 0;
+            using (var surface = session.Surface(Axes.Own))
+            using (var bridge = session.Bridge(new Cautery(), heat))
+            {
+                for (int look = 0; look < 6000 && burnt == 0; look++, Thread.Sleep(10))
+                    if (surface.ReadBurns()) burnt = surface.Burns.Count(burn => burn >= 1.0f);
+                bridge.End();
+            }
             Console.WriteLine(string.Format(CultureInfo.InvariantCulture,
-                "{{\"severed\":{0},\"pieces\":{1},\"version\":{2},\"thread_m\":{3:F5},\"tension_n\":{4:F4}",
-                status.Severed, status.Pieces, status.TopologyVersion, thread.Path, thread.Tension) + "}");
+                "{{\"severed\":{0},\"pieces\":{1},\"version\":{2},\"thread_m\":{3:F5},\"tension_n\":{4:F4},\"burnt\":{5},\"anchors\":{6}",
+                status.Severed, status.Pieces, status.TopologyVersion, thread.Path, thread.Tension, burnt, session.SeveredAnchors) + "}");
             session.Delete();
         }
         return 0;

@@ -10,7 +10,7 @@
 //! - [`devices`]: devices of several makers, loaded at run time, and the placement of their workspace over the
 //!   tissue.
 //! - [`snapshot`]: receives snapshots of sessions; [`upload`]: sends meshes and journals.
-//! - [`surface_view`]: the surface of a session as an engine shows it: positions, normals, triangles.
+//! - [`surface_view`]: the surface of a session as an engine shows it: positions, normals, triangles, burns.
 //! - [`os`]: what depends on the operating system.
 //! - [`watch`]: the samples of a session, without a tool.
 //! - [`view`]: the frames of a session: how its surface moves.
@@ -58,6 +58,7 @@ pub mod followed;
 pub mod held_tools;
 pub mod os;
 pub mod snapshot;
+mod surface_burns;
 pub mod surface_view;
 pub mod touch;
 pub mod upload;

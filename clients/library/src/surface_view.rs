@@ -1,15 +1,19 @@
-//! The surface of a session as an engine shows it: positions and normals of its vertices, and its constant mesh.
+//! The surface of a session as an engine shows it: positions and normals of its vertices, how burnt they are, and its constant mesh.
 
 use std::sync::{Arc, OnceLock};
 
 use palpate_proto::pb;
 use pb::view_service_client::ViewServiceClient;
+use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::connect::Channel;
-use crate::exchange::{NewestReader, NewestWriter, newest};
+use crate::exchange::{self, NewestReader, NewestWriter};
+use crate::surface_burns::follow_burns;
 use crate::view::{Frames, MAX_VERTICES, SurfaceState};
+
+pub use crate::surface_burns::SurfaceBurns;
 
 /// The part of a surface that does not change: rest positions, texture coordinates and triangles.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -42,6 +46,7 @@ pub struct SurfaceMoment {
 pub struct ShownSurface {
     mesh: Arc<ShownMesh>,
     newest: NewestReader<SurfaceMoment>,
+    burns: NewestReader<SurfaceBurns>,
     lost: Arc<OnceLock<String>>,
     _watching: JoinSet<()>,
 }
@@ -72,20 +77,24 @@ impl ShownSurface {
             rate_hz: Some(rate_hz),
             ..Default::default()
         };
-        let frames = Frames::open(channel, request).await?;
+        let frames = Frames::open(channel.clone(), request).await?;
         let at_rest = SurfaceMoment {
             position_m: mesh.rest_m.clone(),
             normal: normals(&mesh.rest_m, &mesh.triangles),
             ..SurfaceMoment::default()
         };
-        let (writer, newest) = newest(&at_rest);
+        let (writer, newest) = exchange::newest(&at_rest);
         let lost = Arc::new(OnceLock::new());
         let mut watching = JoinSet::new();
         let (of_task, told) = (mesh.clone(), lost.clone());
+        let (burn_version, wanted) = watch::channel(0);
         watching.spawn(async move {
-            let _ = told.set(watch(frames, &of_task, writer).await);
+            let _ = told.set(watch(frames, &of_task, writer, burn_version).await);
         });
-        Ok(ShownSurface { mesh, newest, lost, _watching: watching })
+        let unburnt = SurfaceBurns::none(mesh.rest_m.len());
+        let (burns_writer, burns) = exchange::newest(&unburnt);
+        watching.spawn(follow_burns(channel, session_id.to_owned(), refinement, wanted, (unburnt, burns_writer)));
+        Ok(ShownSurface { mesh, newest, burns, lost, _watching: watching })
     }
 
     /// Returns the constant part of the surface, which the server sent when this was opened.
@@ -105,6 +114,13 @@ impl ShownSurface {
         read(self.newest.read())
     }
 
+    /// Takes the newest burns, if there are newer ones than those of the last call, and returns them. They have the order of
+    /// [`ShownMesh`], and come a round trip after the frame that tells of them. Never waits.
+    pub fn burns(&mut self) -> &SurfaceBurns {
+        self.burns.refresh();
+        self.burns.read()
+    }
+
     /// Returns why no newer moment will arrive: the server has ended the frames, the connection broke, or a frame
     /// could not be read. `None` while frames are watched. Once lost, the surface is not watched again: open another.
     pub fn lost(&self) -> Option<&str> {
@@ -112,8 +128,13 @@ impl ShownSurface {
     }
 }
 
-/// Receives frames until there are no more; returns why.
-async fn watch(mut frames: Frames, mesh: &ShownMesh, mut writer: NewestWriter<SurfaceMoment>) -> String {
+/// Receives frames until there are no more; returns why. Tells the version of what is burnt with each.
+async fn watch(
+    mut frames: Frames,
+    mesh: &ShownMesh,
+    mut writer: NewestWriter<SurfaceMoment>,
+    burn_version: watch::Sender<u32>,
+) -> String {
     let mut count = 0;
     loop {
         match frames.next().await {
@@ -124,6 +145,7 @@ async fn watch(mut frames: Frames, mesh: &ShownMesh, mut writer: NewestWriter<Su
                     moment.simulation_time_s = last.simulation_time_s;
                     place(mesh, surface, moment);
                 });
+                burn_version.send_replace(last.burn_version);
             }
             Ok(None) => return "the server has ended the frames".to_owned(),
             Err(status) => return crate::describe(&status),
