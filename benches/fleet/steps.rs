@@ -12,10 +12,10 @@ use serde_json::json;
 
 use crate::cores::{kept_to, processor_s, thread_times};
 use crate::etcd::EtcdMembers;
-use crate::fleet::{Node, until};
+use crate::fleet::Node;
 use crate::report::chart::{Look, Panel, Series};
 use crate::report::{BenchReport, cells, digits, quick};
-use crate::server::{TestServer, TestTouch, force, open};
+use crate::server::{TestServer, TestTouch, force, open, until};
 use crate::{FleetTimes, generous};
 
 /// What is compared: a name, and whether it is of a fleet, and with what else.

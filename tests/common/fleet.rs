@@ -11,7 +11,7 @@
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use palpate_proto::pb;
 use palpate_session::journal::{JournalReader, file, replay};
@@ -20,7 +20,7 @@ use pb::admin_service_client::AdminServiceClient;
 use rustix::process::{Pid, Signal, kill_process};
 use tonic::Status;
 
-use super::server::{TEST_TIMEOUT, TestServer};
+use super::server::{TestServer, until};
 
 /// Fleets at a time: each has several processes, and some have clients at 1 kHz. Most of them wait for most of their time.
 pub static FLEETS: tokio::sync::Semaphore = tokio::sync::Semaphore::const_new(3);
@@ -161,16 +161,6 @@ pub async fn three(folder: &Path, etcd: &[String]) -> Vec<Node> {
 pub async fn create(node: &Node) -> pb::Session {
     let source = pb::create_session_request::Source::SceneName("paper".into());
     node.there().create(source, false).await.unwrap()
-}
-
-/// Waits until `holds`. Tells how long that took.
-pub async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) -> Duration {
-    let begun = Instant::now();
-    while !holds().await {
-        assert!(begun.elapsed() < TEST_TIMEOUT, "never: {what}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-    begun.elapsed()
 }
 
 /// Which of the servers serves a session.

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use palpate_haptics::Law;
 use palpate_proto::{pb, touch};
@@ -30,6 +30,28 @@ use tonic_types::StatusExt;
 
 /// Timeout of a test: long enough for any machine.
 pub const TEST_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Time between two looks at what is waited for.
+const LOOK_INTERVAL: Duration = Duration::from_millis(5);
+
+/// Waits until `holds`, and returns how long that took. Panics with `what` after [`TEST_TIMEOUT`].
+pub async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) -> Duration {
+    let begun = Instant::now();
+    while !holds().await {
+        assert!(begun.elapsed() < TEST_TIMEOUT, "never: {what}");
+        tokio::time::sleep(LOOK_INTERVAL).await;
+    }
+    begun.elapsed()
+}
+
+/// Waits as [`until`] does, on a thread that runs no futures.
+pub fn until_blocking(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < TEST_TIMEOUT, "never: {what}");
+        std::thread::sleep(LOOK_INTERVAL);
+    }
+}
 
 /// A configuration, from the folder of the repository, without the limit on a stepping thread's time.
 const BUSY_MACHINE: &str = "tests/common/busy_machine.toml";

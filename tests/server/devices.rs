@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use crate::common::inverse_service::{InverseService, Wrong, turn};
-use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository};
+use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository, until_blocking};
 use glam::{DQuat, DVec3};
 use palpate_client::bridge::{BridgeReport, Copies, Options, SessionChoice, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
@@ -236,7 +236,7 @@ async fn a_phantom_gets_torque_in_millinewton_metres_and_none_when_the_loop_stan
     let mut device = open("openhaptics", Some(&imitation.library)).unwrap();
     device.write_wrench(Wrench { force_n: DVec3::ZERO, torque_n_m: DVec3::new(0.01, 0.02, 0.03) }).unwrap();
     let set = DVec3::new(10.0, 30.0, -20.0);
-    until("no torque", || {
+    until_blocking("the torque ends", || {
         let torques = imitation.log.vectors("torque");
         torques.last() == Some(&DVec3::ZERO) && torques.iter().any(|torque| near(*torque, set))
     });
@@ -265,14 +265,6 @@ fn is_felt(forces: &[DVec3]) -> bool {
 }
 
 /// Waits until something is so.
-fn until(what: &str, is_so: impl Fn() -> bool) {
-    let begun = std::time::Instant::now();
-    while !is_so() {
-        assert!(begun.elapsed() < TEST_TIMEOUT, "{what}: it does not come");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
-
 fn near(a: DVec3, b: DVec3) -> bool {
     (a - b).length() < 1e-12
 }
@@ -366,7 +358,7 @@ fn a_loop_of_ours_that_stands_still_leaves_a_touch_without_a_force() {
     device.write(DVec3::new(0.1, 0.2, 0.3)).unwrap();
     // To the right, up, towards the operator.
     let set = DVec3::new(0.1, 0.3, -0.2);
-    until("no force", || {
+    until_blocking("the force ends", || {
         imitation.log.vectors("force").last() == Some(&DVec3::ZERO) && imitation.log.vectors("force").contains(&set)
     });
 }
@@ -382,7 +374,7 @@ async fn an_inverse3_is_spoken_to_in_the_words_of_its_services_version() {
         let report = touch(device, &server, move || is_felt(&heard.forces_n())).await;
         assert_eq!(report.traffic.connections, 1);
         let heard = service.heard();
-        until("no force at the end", || heard.forces_n().last() == Some(&DVec3::ZERO));
+        until_blocking("the force ends", || heard.forces_n().last() == Some(&DVec3::ZERO));
         assert_eq!(heard.fields(), [field]);
         // A client of version 3.5 identifies itself once.
         assert_eq!(heard.profiles(), if field == "vector" { vec!["palpate".to_owned()] } else { vec![] });
@@ -433,7 +425,7 @@ async fn an_instrument_led_by_an_inverse3_turns_with_its_grip() {
         };
         assert!(asked.iter().any(is_pressed));
         let heard = service.heard();
-        until("no force at the end", || heard.forces_n().last() == Some(&DVec3::ZERO));
+        until_blocking("the force ends", || heard.forces_n().last() == Some(&DVec3::ZERO));
         for force_n in heard.forces_n() {
             assert!(force_n == DVec3::ZERO || asked.iter().any(|asked| near(asked.force_n, force_n)), "{force_n}");
         }
@@ -644,7 +636,7 @@ async fn positions_that_no_arm_has_give_no_force_and_do_not_end_the_touch() {
     let device = open(&format!("haply:{}", service.url), None).unwrap();
     is_wrong(&touch(device, &server, move || is_let_go(&heard.forces_n())).await);
     is_bounded(&service.heard().forces_n());
-    until("no force at the end", || service.heard().forces_n().last() == Some(&DVec3::ZERO));
+    until_blocking("the force ends", || service.heard().forces_n().last() == Some(&DVec3::ZERO));
 }
 
 #[test]
@@ -670,7 +662,7 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
         assert!(forces.iter().all(|force_n| force_n.length() <= SAFE_FORCE_N), "{wrong:?}");
         // A service that still listens is told to render no force.
         if ![Wrong::Killed, Wrong::Silent].contains(&wrong) && is_touched {
-            until("no force at the end", || service.heard().forces_n().last() == Some(&DVec3::ZERO));
+            until_blocking("the force ends", || service.heard().forces_n().last() == Some(&DVec3::ZERO));
         }
     }
     let nobody = "ws://127.0.0.1:9";
@@ -694,7 +686,7 @@ async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force(
             let (stop, over) = std::sync::mpsc::channel();
             let playing = play(&path, kind, over, last, down_and_up(move || seen.lock().unwrap().0.z));
             let ending = std::thread::spawn(move || {
-                until("it is not felt", || {
+                until_blocking("it is felt", || {
                     let (_, forces) = &*felt.lock().unwrap();
                     is_felt(forces) && forces.last().is_some_and(|force_n| force_n.length() > 0.05)
                 });

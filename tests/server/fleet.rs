@@ -10,8 +10,8 @@ use std::time::Duration;
 
 use crate::common::authority::Authority;
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{self, FLEETS, Node, create, goes_on, owner, three, until, until_stood_by, verify};
-use crate::common::server::{self, TestServer, TestTouch, force, told, waiting};
+use crate::common::fleet::{self, FLEETS, Node, create, goes_on, owner, three, until_stood_by, verify};
+use crate::common::server::{self, TestServer, TestTouch, force, told, until, waiting};
 use palpate_proto::pb;
 use palpate_refusal::status::elsewhere;
 use palpate_session::journal::file;

@@ -23,10 +23,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{FLEETS, Node, create, goes_on, three, until, verify};
+use crate::common::fleet::{FLEETS, Node, create, goes_on, three, verify};
 use crate::common::proxy::Proxy;
 use crate::common::random::TestRandom;
-use crate::common::server::{TestTouch, force};
+use crate::common::server::{TestTouch, force, until};
 use follower::{Doors, Follower, FollowingViewer};
 use palpate_client::fleet::is_fenced;
 use palpate_proto::pb;

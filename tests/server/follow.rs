@@ -2,13 +2,13 @@
 //! rests until its user asks for forces when the server of its session has died.
 #![cfg(target_os = "linux")]
 
-use crate::common::server;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{self, FLEETS, Node, until, until_stood_by};
+use crate::common::fleet::{self, FLEETS, Node, until_stood_by};
+use crate::common::server::{self, until};
 use glam::DVec3;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, run};
 use palpate_client::{Credentials, HapticDevice, Reading};

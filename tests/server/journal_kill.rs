@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use crate::common::random::TestRandom;
-use crate::common::server::{self, TEST_TIMEOUT, TestServer, TestTouch, force};
+use crate::common::server::{self, TestServer, TestTouch, force, until};
 use palpate_proto::pb;
 use palpate_session::journal::file::JournalFile;
 use palpate_session::journal::{JournalReader, file, pb as kept, replay};
@@ -124,14 +124,8 @@ async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
         let clients: Vec<_> =
             ids.iter().map(|id| tokio::spawn(press(server.clone(), id.clone(), told.clone()))).collect();
         // A client has received a report before a kill, whatever the load of the machine.
-        while told.lock().unwrap().len() < ids.len() {
-            assert!(
-                begun.elapsed() < TEST_TIMEOUT,
-                "kill {kill}: only {:?} have a report",
-                told.lock().unwrap().keys()
-            );
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
+        let all = format!("kill {kill}: all sessions have a report");
+        until(&all, async || told.lock().unwrap().len() == ids.len()).await;
         let mut sessions = server.sessions().await;
         for _ in 0..2 {
             tokio::time::sleep(Duration::from_millis(random.below(400))).await;
@@ -149,7 +143,6 @@ async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
         }
         let told = told.lock().unwrap().clone();
         server = start();
-        let restarted = Instant::now();
         let runs = |id: &str| {
             let listed = file::list(&journals).unwrap();
             listed.into_iter().filter(|file| file.session_id == id).collect::<Vec<_>>()
@@ -157,11 +150,11 @@ async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
         for id in &ids {
             let mut session = server.status(id).await;
             // The journal of this run begins a little after the session continues.
-            while session.journal.as_ref().unwrap().durable_step.is_none() {
-                assert!(restarted.elapsed() < TEST_TIMEOUT, "kill {kill}: {id} has no journal again");
-                tokio::time::sleep(Duration::from_millis(5)).await;
+            until(&format!("kill {kill}: {id} has a journal again"), async || {
                 session = server.status(id).await;
-            }
+                session.journal.as_ref().unwrap().durable_step.is_some()
+            })
+            .await;
             assert!(session.step >= told[id].durable_step, "kill {kill}: {} < {:?}", session.step, told[id]);
             let files = runs(id);
             let [before, after] = &files[files.len() - 2..] else { panic!("{files:?}") };

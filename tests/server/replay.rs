@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::{Duration, Instant};
 
 use crate::common::server::{
-    self, TEST_TIMEOUT, TestServer, TestTouch, client_program, force, open, repository, server_program,
+    self, TestServer, TestTouch, client_program, force, open, repository, server_program, until, until_blocking,
 };
 use palpate_proto::pb;
 use serde_json::Value;
@@ -318,17 +317,14 @@ profile = { type = "sine", frequency_hz = 5.0 }
 /// Asks for the only session until it satisfies `wanted`.
 #[cfg(unix)]
 async fn session_that(server: &TestServer, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
-    let mut sessions = server.sessions().await;
-    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
-        loop {
-            let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
-            if let Some(session) = listed.into_iter().find(&wanted) {
-                return session;
-            }
-            tokio::time::sleep(Duration::from_millis(10)).await;
-        }
-    });
-    waited.await.expect("no session is as it should be")
+    let (mut sessions, mut found) = (server.sessions().await, None);
+    until("a session is as it should be", async || {
+        let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+        found = listed.into_iter().find(&wanted);
+        found.is_some()
+    })
+    .await;
+    found.unwrap()
 }
 
 #[cfg(unix)]
@@ -362,16 +358,14 @@ async fn time_waits_for_a_replay_that_stands_still() {
 
 /// Waits until a client is in the middle of a replay: records have come.
 fn until_records(records: &Path, client: &mut Child) {
-    let begun = Instant::now();
-    while std::fs::metadata(records).map_or(0, |meta| meta.len()) < 20_000 {
+    until_blocking("records come", || {
         if let Some(status) = client.try_wait().unwrap() {
             let mut message = String::new();
             client.stderr.take().unwrap().read_to_string(&mut message).unwrap();
             panic!("the client has ended ({status}): {message}");
         }
-        assert!(begun.elapsed() < TEST_TIMEOUT, "no records");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+        std::fs::metadata(records).is_ok_and(|meta| meta.len() >= 20_000)
+    });
 }
 
 #[test]

@@ -10,8 +10,9 @@ use tonic::Code;
 
 use super::fleet_turn;
 use crate::common::etcd::EtcdMembers;
-use crate::common::fleet::{Node, create, owner, three, until, until_stood_by};
+use crate::common::fleet::{Node, create, owner, three, until_stood_by};
 use crate::common::random::TestRandom;
+use crate::common::server::until;
 
 async fn move_to(from: &Node, id: &str, to: &Node) -> Result<pb::MoveSessionResponse, tonic::Status> {
     let request = pb::MoveSessionRequest { session_id: id.to_owned(), node: to.name.clone() };
