@@ -1,9 +1,8 @@
 //! `palpate-client load`: its report is true, and it leaves nothing behind.
 
 use std::process::{Command, Output, Stdio};
-use std::time::Duration;
 
-use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository};
+use crate::common::server::{TestServer, client_program, repository, until};
 use palpate_proto::pb;
 use serde_json::Value;
 
@@ -115,33 +114,23 @@ async fn clients_that_are_killed_leave_no_tool_held_and_no_session() {
         .stdout(Stdio::null())
         .spawn()
         .unwrap();
-    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
-        loop {
-            let sessions = sessions(&server).await;
-            if sessions.len() == 3 && sessions.iter().all(|session| session.commands.unwrap().applied > 10) {
-                break;
-            }
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    });
-    waited.await.expect("the load does not begin");
+    until("the load begins", async || {
+        let sessions = sessions(&server).await;
+        sessions.len() == 3 && sessions.iter().all(|session| session.commands.unwrap().applied > 10)
+    })
+    .await;
     child.kill().unwrap();
     child.wait().unwrap();
-    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
-        loop {
-            let sessions = sessions(&server).await;
-            for commands in sessions.iter().map(|session| session.commands.unwrap()) {
-                let all = commands.applied + commands.superseded + commands.dropped + commands.waiting;
-                assert_eq!(commands.accepted, all, "{commands:?}");
-            }
-            // The tools at once, the sessions when they were idle for 10 s.
-            if sessions.is_empty() {
-                break;
-            }
-            tokio::time::sleep(Duration::from_millis(100)).await;
+    until("the sessions of a load that was killed end", async || {
+        let sessions = sessions(&server).await;
+        for commands in sessions.iter().map(|session| session.commands.unwrap()) {
+            let all = commands.applied + commands.superseded + commands.dropped + commands.waiting;
+            assert_eq!(commands.accepted, all, "{commands:?}");
         }
-    });
-    waited.await.expect("the sessions of a load that was killed stay");
+        // The tools at once, the sessions when they were idle for 10 s.
+        sessions.is_empty()
+    })
+    .await;
 }
 
 /// Hands lead instruments: each pose moves all of their tips. A busy machine has no room for all users.
@@ -235,7 +224,7 @@ async fn a_plan_is_played_by_its_users_and_told_by_second_phase_and_page() {
     assert!(users >= 6.0 && users == sum("/users_arrived") && users == gone, "{told}");
     assert_eq!((number(&told, "/phases/0/users_arrived"), number(&told, "/phases/2/users_arrived")), (3.0, 3.0));
     assert!(sessions(&server).await.is_empty());
-    for kind in ["scenes", "hands", "networks", "viewers"] {
+    for kind in ["scenes", "hands", "networks", "scripts", "viewers"] {
         let drawn: f64 = told["mix"][kind].as_object().unwrap().values().map(|count| count.as_f64().unwrap()).sum();
         assert_eq!(drawn, users, "{kind}");
     }
@@ -253,6 +242,72 @@ async fn a_plan_is_played_by_its_users_and_told_by_second_phase_and_page() {
     let paths: Vec<&str> = page.split("<path d=\"").skip(1).map(|rest| rest.split('"').next().unwrap()).collect();
     assert!(paths.len() > 5 && paths.iter().all(|path| !path.contains("NaN") && !path.contains("inf")), "{paths:?}");
     assert!(!page.contains("http:") && !page.contains("https:") && !page.contains("<script"));
+}
+
+/// A thread and a clip, which are cut again.
+const TIES: &str = r#"
+duration_s = 2.0
+sample_every_s = 1.0
+[[force]]
+point = [10, 10]
+force_n = [0.0, 0.0, -0.5]
+falloff_per_m = 150.0
+falloff_offset = 0.0
+profile = { type = "constant" }
+[[thread]]
+bites = [{ place_m = [0.02, 0.03, 0.0] }, { place_m = [0.03, 0.03, 0.0] }, { place_m = [0.03, 0.04, 0.0] }]
+length_m = [{ at_s = 0.2, length_m = 0.02 }, { at_s = 0.7, length_m = 0.015 }]
+until_s = 1.2
+[[clip]]
+bites = [{ place_m = [0.05, 0.03, 0.0] }, { place_m = [0.053, 0.03, 0.0] }]
+from_s = 0.2
+until_s = 1.2
+"#;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_script_of_a_plan_lays_and_cuts_threads_and_clips_in_the_sessions_of_users_again_and_again() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("ties.toml"), TIES).unwrap();
+    let server = TestServer::start(&["--scripts", folder.path().to_str().unwrap()]);
+    // A user whose instrument has many tools, and one that pushes.
+    let plan = "[[scene]]\nname = \"liver\"\n[[script]]\nname = \"ties\"\n[[hand]]\nhand = \"push\"\n[[hand]]\nhand = \"light\"\n\
+                instrument = \"grasper\"\n[[phase]]\nseconds = 1000\narrivals = \"spike\"\nusers = 4\n";
+    let path = folder.path().join("plan.toml");
+    std::fs::write(&path, plan).unwrap();
+    let mut command = Command::new(client_program());
+    command.args(["load", "--quiet", "--json", "--server", &server.url, "--plan", path.to_str().unwrap()]);
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    for ties in [2, 0, 2, 0] {
+        // Each of the sessions has come so far, not all of them at once.
+        let mut done = std::collections::BTreeSet::new();
+        until(&format!("{ties} threads and clips"), async || {
+            for session in sessions(&server).await {
+                if session.ties.len() == ties && session.step > 0 {
+                    assert!(session.ties.iter().all(|laid| !laid.broken), "{session:?}");
+                    done.insert(session.session_id);
+                }
+            }
+            done.len() == 4
+        })
+        .await;
+    }
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    let output = child.wait_with_output().unwrap();
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(told["why"], "the plan was interrupted");
+    assert_eq!(told["mix"]["scripts"], serde_json::json!({ "ties": 4 }));
+    assert_eq!((number(&told, "/all/broken_streams"), number(&told, "/all/rejected")), (0.0, 0.0), "{told}");
+    assert!(told["mix"]["hands"].as_object().unwrap().len() == 2, "{told}");
+    assert!(sessions(&server).await.is_empty());
+    // A script that the server lacks, or that does not fit, turns its users away.
+    let unknown = "[[script]]\nname = \"nothing\"\n[[phase]]\nseconds = 1.5\narrivals = \"spike\"\nusers = 1\n";
+    let refused = planned(&server, folder.path(), unknown, &[]);
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(
+        refused.status.code() == Some(1) && said.contains("no user could touch: ") && said.contains("nothing"),
+        "{said}"
+    );
+    assert!(sessions(&server).await.is_empty());
 }
 
 #[tokio::test(flavor = "multi_thread")]

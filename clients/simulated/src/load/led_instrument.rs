@@ -45,6 +45,11 @@ impl InstrumentKind {
         }
     }
 
+    /// Returns how many tips, and so tools, the instrument has.
+    pub(crate) fn tips(self) -> u32 {
+        u32::try_from(self.instrument().tips.len()).unwrap_or(u32::MAX)
+    }
+
     /// Returns the instrument.
     fn instrument(self) -> Instrument {
         let tip = Tip { radius_m: RADIUS_M, ..Tip::default() };

@@ -11,6 +11,7 @@ mod objective;
 mod plan;
 mod plan_run;
 mod report;
+mod script_player;
 mod stroke;
 mod tally;
 mod tip;

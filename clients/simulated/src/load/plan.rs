@@ -24,6 +24,9 @@ const MAX_USERS: usize = 10_000;
 /// Time for which a user stays without another value, s: longer than any trial.
 pub(crate) const STAYS_S: f64 = 86_400.0;
 
+/// The name that stands for no script in a list of scripts.
+pub(crate) const NO_SCRIPT: &str = "none";
+
 /// Largest number of entries of a list; a longer list is refused.
 const MAX_ENTRIES: usize = 64;
 
@@ -130,6 +133,8 @@ pub struct LoadPlan {
     /// Alternatives of what leads the tools; `None`: forces push the tissue along a stroke.
     pub(crate) leads: Vec<Share<Option<Lead>>>,
     pub(crate) wires: Vec<Share<Wire>>,
+    /// Scripts of the server that are played in the sessions, again and again; `None`: nothing is.
+    pub(crate) scripts: Vec<Share<Option<String>>>,
     pub(crate) viewers: Vec<Share<Viewers>>,
     pub(crate) phases: Vec<Phase>,
     /// Objective of the whole plan.
@@ -146,6 +151,7 @@ pub(crate) struct User {
     pub(crate) scene: usize,
     pub(crate) lead: usize,
     pub(crate) wire: usize,
+    pub(crate) script: usize,
     pub(crate) viewers: usize,
     /// Seed of the movements of its hand.
     pub(crate) seed: u64,
@@ -195,7 +201,7 @@ impl LoadPlan {
 
     /// Returns all users by arrival, the same for the same plan. The list has at most one more than [`MAX_USERS`].
     pub(crate) fn users(&self) -> Vec<User> {
-        let (mut times, mut mix) = (Random::new(self.seed, 1), Random::new(self.seed, 2));
+        let [mut times, mut mix, mut played] = [1, 2, 3].map(|stream| Random::new(self.seed, stream));
         let (mut users, mut from_s) = (Vec::new(), 0.0);
         for phase in &self.phases {
             let (seconds, stays_s, mut at_s) = (phase.seconds, phase.stays_s, 0.0);
@@ -225,7 +231,8 @@ impl LoadPlan {
                 let (at_s, seed) = (from_s + at_s, self.seed.wrapping_add(users.len() as u64));
                 let (scene, lead) = (draw(&self.scenes, &mut mix), draw(&self.leads, &mut mix));
                 let (wire, viewers) = (draw(&self.wires, &mut mix), draw(&self.viewers, &mut mix));
-                users.push(User { at_s, stays_s, scene, lead, wire, viewers, seed });
+                let script = draw(&self.scripts, &mut played);
+                users.push(User { at_s, stays_s, scene, lead, wire, script, viewers, seed });
             }
             from_s += phase.seconds;
         }
@@ -285,6 +292,10 @@ fn plan(fields: &mut Fields<'_>) -> Result<LoadPlan> {
     let scenes = parts(fields, "scene", "liver".to_owned(), |fields| fields.required("name")?.text())?;
     let leads = parts(fields, "hand", None, lead)?;
     let wires = parts(fields, "network", Wire::direct(), wire)?;
+    let scripts = parts(fields, "script", None, |fields| {
+        let name = fields.required("name")?.text()?;
+        Ok((name != NO_SCRIPT).then_some(name))
+    })?;
     let viewers = parts(fields, "viewers", Viewers { number: 0, rate_hz: 60.0 }, |fields| {
         let number = count(&fields.required("number")?, 16)?;
         let rate_hz = within(fields, "rate_hz", "from 0.1 to 1000", 0.1, 1000.0)?.unwrap_or(60.0);
@@ -309,6 +320,7 @@ fn plan(fields: &mut Fields<'_>) -> Result<LoadPlan> {
         scenes,
         leads,
         wires,
+        scripts,
         viewers,
         phases,
         objective,
@@ -449,6 +461,10 @@ name = "near"
 [[network]]
 name = "far"
 delay_ms = 20
+[[script]]
+name = "none"
+[[script]]
+name = "suture"
 [[viewers]]
 number = 2
 rate_hz = 30
@@ -489,6 +505,12 @@ seconds = 5
         assert!((0.68..0.82).contains(&first), "{first}");
         let lead = plan.leads[1].what.unwrap();
         assert_eq!((lead.hand.unwrap().name, lead.device.name, lead.deadbands.down), ("firm", "touch", 0.1));
+        assert_eq!(
+            plan.scripts.iter().map(|script| script.what.as_deref()).collect::<Vec<_>>(),
+            [None, Some("suture")]
+        );
+        let sewn = users.iter().filter(|user| user.script == 1).count() as f64 / users.len() as f64;
+        assert!((0.4..0.6).contains(&sewn), "{sewn}");
         assert!(plan.wires[0].what.conditions.is_none());
         assert!((plan.wires[1].what.conditions.unwrap().round_trip_s - 0.04).abs() < 1e-12);
     }
@@ -525,6 +547,7 @@ seconds = 5
             ),
             (&format!("{phase}[[network]]\nname = \"x\"\nloss = 2"), ":5", "network[0].loss", "from 0 to 0.5"),
             (&format!("{phase}[[network]]\nname = \"x\"\ndelay = 2"), ":5", "network[0].delay", "delay_ms"),
+            (&format!("{phase}[[script]]\nshare = 1"), ":3", "script[0].name", "is missing"),
             (&format!("{phase}[[viewers]]\nnumber = 99"), ":4", "viewers[0].number", "at most 16"),
             (&format!("{phase}[[scene]]\nname = \"x\"\nshare = 0"), "", "scene", "share above 0"),
             ("[[phase]]\nseconds = 80000\narrivals = \"steady\"\nrate_per_s = 1", "", "phase", "10000 users"),

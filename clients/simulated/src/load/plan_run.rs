@@ -8,7 +8,7 @@ use palpate_client::bridge::Warn;
 use palpate_client::{Error, Server};
 use palpate_proto::pb::create_session_request::Source;
 use palpate_refusal::Refusal;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{OnceCell, mpsc, watch};
 use tokio::task::JoinSet;
 
 use super::client::{LoadStage, lock};
@@ -114,6 +114,8 @@ async fn run(
     let (counting, counted_s) = watch::channel(0.0);
     let (arrived, mut arrivals) = mpsc::unbounded_channel();
     let (servers, sources): (Arc<[_]>, Arc<[_]>) = (servers.into(), sources.into());
+    let cells = |_| plan.scripts.iter().map(|_| OnceCell::new()).collect::<Vec<_>>();
+    let scripts: Arc<[_]> = (0..plan.scenes.len()).map(cells).collect();
     let (plan, clock) = (Arc::new(plan), Instant::now());
     let threads = (plan.threads as usize).min(users.len()).max(1);
     let mut workers = Vec::new();
@@ -124,6 +126,7 @@ async fn run(
             plan: plan.clone(),
             servers: servers.clone(),
             sources: sources.clone(),
+            scripts: scripts.clone(),
             clock,
             tally,
             turns: turns.clone(),

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::led_instrument::InstrumentKind;
 use super::objective::Objective;
-use super::plan::{LoadPlan, User};
+use super::plan::{LoadPlan, NO_SCRIPT, User};
 use super::tally::{LoadOutcome, Tally, listed};
 
 /// Counts of a load test within one second of its plan, for [`super::PreparedPlan::run`] to report as they come. The
@@ -72,7 +72,7 @@ pub struct LoadReport {
     points: Vec<Point>,
     phases: Vec<Stretch>,
     whole: Stretch,
-    /// Numbers of users by scene, hand, network and viewers.
+    /// Numbers of users by scene, hand, network, script and viewers.
     mix: Value,
     pub(crate) is_interrupted: bool,
     /// Processor time of this generator per second, cores.
@@ -84,9 +84,9 @@ fn away(reasons: &BTreeMap<String, u64>) -> String {
     if reasons.is_empty() { "none".to_owned() } else { listed(reasons) }
 }
 
-/// Returns the numbers of users of a plan by scene, hand, network and number of viewers.
+/// Returns the numbers of users of a plan by scene, hand, network, script and number of viewers.
 fn mix(plan: &LoadPlan, users: &[User]) -> Value {
-    let mut counts: [BTreeMap<String, u64>; 4] = Default::default();
+    let mut counts: [BTreeMap<String, u64>; 5] = Default::default();
     for user in users {
         let hand = plan.leads[user.lead].what.map_or("push".to_owned(), |lead| {
             let with = lead.instrument.map_or(lead.device.name, InstrumentKind::name);
@@ -96,14 +96,15 @@ fn mix(plan: &LoadPlan, users: &[User]) -> Value {
             plan.scenes[user.scene].what.clone(),
             hand,
             plan.wires[user.wire].what.name.clone(),
+            plan.scripts[user.script].what.clone().unwrap_or_else(|| NO_SCRIPT.to_owned()),
             plan.viewers[user.viewers].what.number.to_string(),
         ];
         for (counts, name) in counts.iter_mut().zip(names) {
             *counts.entry(name).or_default() += 1;
         }
     }
-    let [scenes, hands, networks, viewers] = counts;
-    json!({ "scenes": scenes, "hands": hands, "networks": networks, "viewers": viewers })
+    let [scenes, hands, networks, scripts, viewers] = counts;
+    json!({ "scenes": scenes, "hands": hands, "networks": networks, "scripts": scripts, "viewers": viewers })
 }
 
 /// Returns an outcome whose dilation is that of the worst second.

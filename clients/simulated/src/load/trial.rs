@@ -55,6 +55,7 @@ impl LoadTrial {
             scenes: only(self.scene.clone()),
             leads: only(lead),
             wires: only(Wire::direct()),
+            scripts: only(None),
             viewers: only(Viewers { number: self.viewers, rate_hz: self.frame_rate_hz }),
             phases: vec![phase],
             objective: None,

@@ -3,19 +3,21 @@
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use palpate_client::{Channel, Error, Server, describe, fleet};
+use palpate_client::{Channel, Error, Followed, Server, describe, fleet};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
-use tokio::sync::watch;
+use tokio::sync::{OnceCell, watch};
 use tokio::task::JoinSet;
 use tonic::{Response, Status};
 
 use super::client::{Client, Common, LoadStage, SampleTimes, lock};
 use super::connections::{ConnectionPurpose, Connections};
+use super::led_instrument::InstrumentKind;
 use super::plan::{LoadPlan, User, Viewers};
+use super::script_player::{ScriptCommands, ScriptPlayer};
 use super::stroke::Stroke;
 use super::tally::Tally;
 use super::viewer::view;
@@ -36,6 +38,8 @@ pub(crate) struct UserContext {
     pub(crate) servers: Arc<[Server]>,
     /// The sources of the plan's scenes.
     pub(crate) sources: Arc<[Source]>,
+    /// The scripts of the plan for each of its scenes, once a user has got them.
+    pub(crate) scripts: Arc<[Vec<OnceCell<Arc<ScriptCommands>>>]>,
     pub(crate) clock: Instant,
     pub(crate) tally: Arc<Mutex<Tally>>,
     /// The ticks of each turn, at which clients send.
@@ -162,6 +166,9 @@ impl UserSession {
             self.streams
                 .spawn(client.open(connections.to(&self.server, ConnectionPurpose::Touch).await?, ticks).await?);
         }
+        if let Some(name) = &plan.scripts[user.script].what {
+            self.play(context, user, name, common.clone()).await?;
+        }
         if plan.clients_per_user == 0 {
             self.keep_awake(plan, whole, created.step).await?;
         }
@@ -170,6 +177,19 @@ impl UserSession {
             let (id, frames_hz) = (self.session_id.clone(), frames_hz.min(self.rate_hz));
             self.streams.spawn(view(common.clone(), channel, id, frames_hz, sample_times.clone()).await?);
         }
+        Ok(())
+    }
+
+    /// Begins to play a script, by tools behind those of the clients.
+    async fn play(&mut self, context: &UserContext, user: &User, name: &str, common: Common) -> Result<(), Error> {
+        let session = Followed::new(self.server.clone(), self.channel.clone(), self.session_id.clone());
+        let known = &context.scripts[user.scene][user.script];
+        let get = async || ScriptCommands::get(&session, name).await.map(Arc::new);
+        let script = known.get_or_try_init(get).await?.clone();
+        let instrument = common.touches.and_then(|lead| lead.instrument);
+        let first_tool = context.plan.clients_per_user * instrument.map_or(1, InstrumentKind::tips);
+        let player = ScriptPlayer::new(common, session, self.rate_hz, script, first_tool).await?;
+        self.streams.spawn(player.play());
         Ok(())
     }
 
