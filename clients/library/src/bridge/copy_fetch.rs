@@ -70,7 +70,6 @@ impl Copying {
     /// Starts building a copy of the current tissue. Aborts an earlier one that is not finished.
     pub(super) fn begin(&mut self) {
         self.follower.follow(None);
-        self.call.abort();
         let Some(Copier { copies: Copies { make, .. }, places }) = self.copier.clone() else { return };
         let (channel, session_id, instrument) =
             (self.channel.clone(), self.session_id.clone(), self.instrument.clone());

@@ -10,7 +10,7 @@ use crate::dice::Dice;
 const HALF: f64 = 50.0;
 
 /// A rise above a lump.
-struct Lump {
+struct Rise {
     centre: DVec2,
     radius: f64,
     height: f64,
@@ -19,18 +19,18 @@ struct Lump {
 /// Returns the shape of the patch. It extends along x and y; the side to touch is above (z).
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let curvature = dice.within(1.0 / 500.0, 1.0 / 260.0);
-    // One lump in each third of the patch, so that they stay apart.
-    let lumps = [-1.0, 0.0, 1.0].map(|third| Lump {
+    // One rise in each third of the patch, so that they stay apart.
+    let rises = [-1.0, 0.0, 1.0].map(|third| Rise {
         centre: DVec2::new(27.0 * third + dice.within(-3.0, 3.0), dice.within(-28.0, 28.0)),
         radius: dice.within(8.0, 13.0),
         height: dice.within(1.4, 2.8),
     });
-    let within = lumps.iter().map(|lump| (lump.centre, lump.radius)).collect::<Vec<_>>();
+    let within = rises.iter().map(|rise| (rise.centre, rise.radius)).collect::<Vec<_>>();
     let uneven = Unevenness::new(0.35, 38.0, dice);
     let distance = move |place: DVec3| {
         let flat = place.truncate();
-        let rise = |lump: &Lump| lump.height * bump((flat - lump.centre).length() / (1.5 * lump.radius));
-        let height = lumps.iter().map(rise).sum::<f64>() - 0.5 * curvature * flat.length_squared();
+        let above = |rise: &Rise| rise.height * bump((flat - rise.centre).length() / (1.5 * rise.radius));
+        let height = rises.iter().map(above).sum::<f64>() - 0.5 * curvature * flat.length_squared();
         place.z - height - uneven.at(flat.extend(0.0))
     };
     let extent = [DVec3::new(-HALF, -HALF, -20.0), DVec3::new(HALF, HALF, 13.0)];
