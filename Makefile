@@ -46,7 +46,7 @@ help:
 	@echo 'make test-mutants    the number of 300 mutants of kernel, touch and sessions that the tests catch (an hour or two)'
 	@echo 'make stress          ten thousand random scenes, a million steps on 200 meshes, ten million steps, a thousand thin meshes,'
 	@echo '                     five thousand snapshots (an hour or two)'
-	@echo 'make stress-cuts     random cuts, tears, threads and clips until CUTS=1000000 springs are severed, from seed FROM=0 on, with progress'
+	@echo 'make stress-cuts     random cuts, burns, tears, threads and clips until CUTS=1000000 springs are severed, from seed FROM=0 on, with progress'
 	@echo 'make fuzz            a million malformed inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
 	@echo 'make lint            formatting, compiler and clippy warnings, and the counts of tests/counts.py'

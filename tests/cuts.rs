@@ -1,4 +1,4 @@
-//! Random cuts and tears in sheets, surfaces and solids, with tools that press and pull beside the blades, threads and clips that are
+//! Random cuts, burns and tears in sheets, surfaces and solids, with tools that press and pull beside the blades, threads and clips that are
 //! laid and taken out, saved and restored in the middle of it: numbers stay finite, the pieces are those that a search finds, and a restored
 //! tissue has the bits of the one that was saved.
 //!
@@ -175,7 +175,8 @@ fn step(tissue: &mut dyn Tissue) -> bool {
 
 /// Cuts a tissue at random for twelve rounds. Returns how many springs are severed.
 fn cut_at_random(model: &Arc<Model>, seed: u64) -> usize {
-    let mut random = fastrand::Rng::with_seed(seed);
+    // That of burns is of its own: without them seeds cut as they do.
+    let (mut random, mut heat) = (fastrand::Rng::with_seed(seed), fastrand::Rng::with_seed(!seed));
     let mut tissue = at_rest(model);
     let extent = model.shape().extent();
     let (size_m, length_m) = (extent.size_m(), 0.4 * model.shape().longest_side_m());
@@ -186,6 +187,7 @@ fn cut_at_random(model: &Arc<Model>, seed: u64) -> usize {
     for round in 0..12 {
         let (from_m, to_m, tip) = (place_m(&mut random), place_m(&mut random), blade(&mut random, length_m));
         let presser = Tip { radius_m: model.shape().edge_m(), grasps: random.bool(), ..Tip::default() };
+        let presser = Tip { burn_s: if heat.u8(0..3) == 0 { 0.005 + 0.02 * heat.f64() } else { 0.0 }, ..presser };
         let on_surface = |random: &mut fastrand::Rng| model.shape().rest_m(model.shape().nearest(place_m(random)));
         let pressed_m = on_surface(&mut random);
         // A tip that holds also pulls, so that the tissue tears.

@@ -310,7 +310,7 @@ fn pose(case: &mut SnapshotCase, random: &mut Rng, tool: u32, [from, until]: [u6
         friction: [0.0, 0.1, 0.5][random.usize(0..3)],
         grasps: random.u8(0..3) == 0,
         coupling: if random.bool() { Coupling::Constraint } else { spring },
-        burn_s: if !shape.takes_rigid_tips() && random.u8(0..3) == 0 { 0.01 } else { 0.0 },
+        burn_s: if random.u8(0..3) == 0 { 0.01 } else { 0.0 },
         ..Tip::default()
     };
     let (kind, burst) = (random.u8(0..4), random.u64(1..12));

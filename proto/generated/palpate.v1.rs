@@ -1697,8 +1697,8 @@ pub struct Tip {
     /// `Instrument`, in that of the instrument. Absent for other shapes.
     #[prost(message, optional, tag = "6")]
     pub edge_m: ::core::option::Option<Vector3>,
-    /// Cautery: the time of contact after which what lies under its disc is severed, s, 0 to 3600; 0: it does not burn. Times
-    /// of contact add up. It may change from pose to pose. For a disc, on sheets and surfaces only.
+    /// Cautery: the time of contact after which what lies under the tip is severed, s, 0 to 3600; 0: it does not burn. Times
+    /// of contact add up. It may change from pose to pose. For all tips but blades; a solid burns to the depth of a cell.
     #[prost(double, tag = "7")]
     pub burn_s: f64,
 }

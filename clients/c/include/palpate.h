@@ -397,7 +397,7 @@ typedef struct palpate_touch_options {
   struct palpate_vector edge;
   /**
    * Cautery: the time of contact after which the tissue under the tip is severed, s, up to 3600; 0 (default): it does not burn. For
-   * `PALPATE_TIP_DISC`, on sheets and surfaces.
+   * all tips but `PALPATE_TIP_BLADE`.
    */
   double burn_s;
 } palpate_touch_options;

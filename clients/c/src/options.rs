@@ -128,7 +128,7 @@ pub struct palpate_touch_options {
     /// along Palpate's x. Default 0: none.
     pub edge: palpate_vector,
     /// Cautery: the time of contact after which the tissue under the tip is severed, s, up to 3600; 0 (default): it does not burn. For
-    /// `PALPATE_TIP_DISC`, on sheets and surfaces.
+    /// all tips but `PALPATE_TIP_BLADE`.
     pub burn_s: f64,
 }
 

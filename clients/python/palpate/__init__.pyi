@@ -132,7 +132,7 @@ class Tip:
     """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
     `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
     `edge_m` it is a blade, whose edge runs from its place by that vector. With
-    `burn_s`, s, a disc severs by heat what it has touched for that time: on sheets and surfaces only."""
+    `burn_s`, s, a tip that is no blade severs by heat what it has touched for that time."""
 
     def __init__(
         self,
@@ -295,7 +295,8 @@ class Session:
     def velocities(self, out: Optional[Vectors] = None) -> Vectors:
         """Returns the velocity of each point, m/s. `out` is an array to write into."""
     def burns(self) -> NDArray[np.float64]:
-        """Returns how burnt each point is by cautery: the time of contact divided by that in which it burns through, 0 to 1."""
+        """Returns how burnt each point is by cautery: the time of contact divided by that in which it burns through, 0 to 1.
+        In a solid that of the most burnt cell around the point."""
     def records(self, points: Optional[Iterable[Point]] = None) -> NDArray[Any]:
         """Returns records of all quantities of the given points, as in `Run.points`; of all points if None."""
     @property

@@ -404,6 +404,7 @@ impl Session {
     }
 
     /// Returns how burnt each point is by cautery: the time of contact divided by that in which it burns through, 0 to 1.
+    /// In a solid that of the most burnt cell around the point.
     fn burns<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let burns = self.with(py, |inner| {
             let tissue = inner.simulation.session.tissue();

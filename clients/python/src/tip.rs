@@ -7,7 +7,7 @@ use pyo3::prelude::*;
 /// The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring. With
 /// `shape="rigid"` it is a flat rigid disc, with `shape="sphere"` a rigid sphere, whose place is its centre: on solids only. With
 /// `edge_m` it is a blade, whose edge runs from its place by that vector. With
-/// `burn_s`, s, a disc severs by heat what it has touched for that time: on sheets and surfaces only.
+/// `burn_s`, s, a tip that is no blade severs by heat what it has touched for that time.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);

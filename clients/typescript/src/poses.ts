@@ -21,7 +21,7 @@ export interface Tip {
   shape?: TipShape;
   /** The edge of a blade from the tip, which is the tool's place, to its heel, m: in the frame of the tissue, or of the instrument. */
   edgeM?: Vec3;
-  /** The time of contact after which a disc severs what lies under it, s (cautery). It does not burn if absent. */
+  /** The time of contact after which a tip that is no blade severs what lies under it, s (cautery). It does not burn if absent. */
   burnS?: number;
   /** Whether it holds the tissue, and pulls as well as pushes; else it touches. Discs only. */
   grasps?: boolean;

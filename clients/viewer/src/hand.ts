@@ -43,8 +43,6 @@ export interface Reach {
   tipShape: TipShape;
   /** Number of tips of a grasper's jaw: on a mesh, each takes much time to compute. */
   jawTips: number;
-  /** Whether a cautery burns the tissue: a solid is not burnt. */
-  canBurn: boolean;
 }
 
 export class Hand {
@@ -102,7 +100,7 @@ export class Hand {
     const former = this.tool;
     this.isLeft = false;
     former.rest();
-    this.chosen = mode === "cautery" && !this.reach.canBurn ? "tip" : mode;
+    this.chosen = mode;
     if (former !== this.tool) this.tool.takeAfter(former.letGo());
   }
 
@@ -276,7 +274,7 @@ export class Hand {
   private tip({ restM, outward }: Place, now: number): Lead {
     const { lengthM, depthM, tipShape } = this.reach;
     const positionM = plus(restM, outward, this.outM(now));
-    if (this.mode === "cautery") return { positionM, radiusM: CAUTERY.radius * lengthM, shape: TipShape.DISC, burnS: BURN_S };
+    if (this.mode === "cautery") return { positionM, radiusM: CAUTERY.radius * lengthM, shape: tipShape, burnS: BURN_S };
     if (this.mode !== "blade") return { positionM, radiusM: lengthM, shape: tipShape };
     const edgeM = plus([0, 0, 0], outward, EDGE * depthM);
     const bladeM = plus(positionM, this.shiftedM);

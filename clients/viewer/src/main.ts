@@ -19,7 +19,7 @@ import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { Lumps } from "./lumps";
-import { cauteryText, cutText, feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, undoText, wayText, wellText } from "./messages";
+import { cutText, feltText, isDeep, isLess, meaningText, refusedText, sentence, strengthText, undoText, wayText, wellText } from "./messages";
 import { Overlay, type ToolLabel } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, withSession, writeAddress, writeMoment } from "./page";
 import { pageState } from "./page-state";
@@ -505,11 +505,7 @@ function tellControls(): void {
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(shownSession.refinement);
   part("meaning", HTMLElement).textContent = meaningText(shownSession);
-  for (const choice of modeChoices()) {
-    choice.checked = choice.value === shownSession.hand.mode;
-    if (choice.value === "cautery") choice.disabled = !shownSession.reach.canBurn;
-  }
-  part("cautery-part", HTMLElement).title = cauteryText(shownSession);
+  for (const choice of modeChoices()) choice.checked = choice.value === shownSession.hand.mode;
   part("strength", HTMLInputElement).value = String(shownSession.hand.strength);
   part("strength-part", HTMLElement).hidden = sews(shownSession.hand.mode);
   part("view", HTMLElement).classList.toggle("sews", sews(shownSession.hand.mode));
@@ -684,7 +680,7 @@ let exhaustedIn: ShownSession | undefined;
 function warnIfExhausted(of: ShownSession): void {
   if (of === exhaustedIn || !of.session.cutsExhausted || of.session.severed === 0) return;
   exhaustedIn = of;
-  notice("This solid has no room for further cuts: from now on a blade only pushes.", 15);
+  notice("This solid has no room for further cuts: from now on a blade only pushes, and a cautery severs nothing.", 15);
 }
 
 stage.onDrawn = () => {

@@ -114,11 +114,6 @@ function toldText(told: Told, verb: string): string {
   return [depthText(told), force, jawsText(told)].filter((text) => text !== "").join(", ");
 }
 
-/** Says what a cautery does, or that there is none for this tissue. */
-export function cauteryText({ reach: { canBurn } }: ShownSession): string {
-  return canBurn ? "A small tip that burns what it touches: it turns dark, and is severed" : "Only sheets and surfaces are burnt, not a solid";
-}
-
 /** Describes what blades have cut, as far as it is known here; undefined if nothing is. */
 export function cutText({ session: { severed, severedAnchors, pieces, cutsExhausted }, cutters, wound }: ShownSession): string | undefined {
   if (severed === 0) return undefined;

@@ -137,8 +137,7 @@ export class ShownSession {
     this.rateHz = session.scene?.stepping?.rateHz ?? 1000;
     const k = session.scene?.springs?.stiffnessNPerM ?? 0;
     const anchor = session.scene?.anchorSprings?.stiffnessNPerM ?? 0;
-    const canBurn = session.scene?.solid === undefined;
-    const tipShape = canBurn ? TipShape.DISC : TipShape.RIGID_DISC;
+    const tipShape = session.scene?.solid === undefined ? TipShape.DISC : TipShape.RIGID_DISC;
     if (mesh) {
       const sizeM = boxOf(mesh);
       const lengthM = fingerM(sizeM, mesh.edgeM);
@@ -148,13 +147,13 @@ export class ShownSession {
       const { sum } = this.surface.push(this.surface.middle(), lengthM);
       // If the springs of a tissue differ, no such force can be given.
       const mostN = rounded(sum * aPointN || 2);
-      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape, jawTips: 1, canBurn };
+      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM, tipShape, jawTips: 1 };
       this.widthM = sizeM;
     } else {
       // A push falls off over a spacing, so that a few points share it: its depth is about two spacings.
       const lengthM = grid?.spacingM ?? 1;
       const mostN = 2 * lengthM * (2 * k + anchor) || lengthM;
-      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape, jawTips: 3, canBurn };
+      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM, tipShape, jawTips: 3 };
       this.widthM = (this.points[0] - 1) * lengthM;
     }
     // A mesh is shown with its own vertices.

@@ -97,11 +97,18 @@ describe("a cautery", () => {
     await close(page);
   });
 
-  test("is not for a solid", async () => {
+  test("burns the cells of a solid, and severs them from each other", async () => {
     const page = await open(`${server.url}/?scene=liver-solid&tool=cautery`);
-    assert.ok(await page.page.isDisabled("input[value=cautery]"));
-    assert.ok(await page.page.isChecked("input[value=tip]"));
-    assert.match((await page.page.getAttribute("#cautery-part", "title")) ?? "", /not a solid/);
+    assert.ok(await page.page.isChecked("input[value=cautery]"));
+    await page.until(({ drawing }) => drawing.hasTexture);
+    const before = await lightNear(page, 0.5, 0.5);
+    await page.press(0.5, 0.5);
+    await page.until(({ burns }) => burns.through > 0);
+    await page.until(({ wound }) => wound.severed > 2);
+    await leave(page);
+    await page.picture("burn-of-solid");
+    const burnt = await lightNear(page, 0.5, 0.5);
+    assert.ok(burnt.darkest < 0.5 * before.darkest, `${burnt.darkest} where it burnt, ${before.darkest} before`);
     assert.deepEqual(page.complaints, []);
     await close(page);
   });

@@ -86,8 +86,8 @@ pub struct Tip {
     /// The edge of a blade, from its tip to its heel, m, in the tissue's frame; in an instrument's tips, in the instrument's frame. 0
     /// for every other shape.
     pub edge_m: DVec3,
-    /// The time of contact after which it severs the tissue under its disc by heat (cautery), s; 0: it does not burn. Only discs on
-    /// sheets and surfaces burn.
+    /// The time of contact after which it severs the tissue under it by heat (cautery), s; 0: it does not burn. A blade does not
+    /// burn.
     pub burn_s: f64,
 }
 

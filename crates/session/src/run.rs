@@ -196,8 +196,10 @@ pub fn run_observed(
         )
     });
     let crushed = jaws.warning(model.scene.stepping.rate_hz);
-    let exhausted = (session.cuts_exhausted() && has_blade(script)).then(|| {
-        "blades only push in the end: the solid has no spare places left for the corners that another cut would double".to_owned()
+    let exhausted = (session.cuts_exhausted() && severs(script)).then(|| {
+        "blades only push in the end, and burns sever nothing: the solid has no spare places left for the corners that another cut \
+         would double"
+            .to_owned()
     });
     let warnings = far_warning(largest_displacement_m, model.shape())
         .into_iter()
@@ -318,11 +320,11 @@ impl WatchedJaws {
     }
 }
 
-/// Returns whether a script has a blade.
-fn has_blade(script: &Script) -> bool {
+/// Returns whether a script has a tip that severs: a blade, or one that burns.
+fn severs(script: &Script) -> bool {
     let of_instruments = script.instruments.iter().flat_map(|profile| &profile.instrument.tips).map(|tip| &tip.tip);
     let mut tips = script.poses.iter().map(|profile| &profile.tip).chain(of_instruments);
-    tips.any(|tip| tip.shape == TipShape::Blade)
+    tips.any(|tip| tip.shape == TipShape::Blade || tip.burn_s > 0.0)
 }
 
 /// Returns the disc of the first tip of a script, where it is first; without a tip that of a fingertip in the middle.

@@ -1,7 +1,9 @@
-//! What tips have burnt, at the vertices that frames show: that of the points, and between these interpolated as displacements are.
+//! What tips have burnt, at the vertices that frames show: that of the points, and between these interpolated as displacements are. In a
+//! solid a point is as burnt as the most burnt cell around it: a vertex in a cell that has burnt through has burnt through, and beside it
+//! the burn fades over a cell.
 
 use palpate_tissue::memory;
-use palpate_tissue::{Burns, Model};
+use palpate_tissue::{Burns, BurntPoint, Model};
 
 use super::refine::Refinement;
 use super::skin::Skin;
@@ -28,13 +30,15 @@ pub fn vertex_burns(
     since: u32,
 ) -> Vec<VertexBurn> {
     let is_new = |version: u32| since == 0 || version > since;
-    if !burns.points(model).any(|burnt| is_new(burnt.version)) {
+    let points: Vec<BurntPoint> = burns.points(model).collect();
+    if !points.iter().any(|burnt| is_new(burnt.version)) {
         return Vec::new();
     }
     // The burn of each place in memory, and whether it is new.
     let place = |index: usize| model.shown_order().map_or(index, |[_, places]| places[index] as usize);
-    let mut of_places: Vec<(f32, bool)> = memory::filled(model.len(), (0.0, false), TABLES);
-    for burnt in burns.points(model) {
+    let places = model.shown_order().map_or(model.len(), |[order, _]| order.len());
+    let mut of_places: Vec<(f32, bool)> = memory::filled(places, (0.0, false), TABLES);
+    for burnt in points {
         #[allow(clippy::cast_possible_truncation)]
         if let Some(of_place) = of_places.get_mut(place(burnt.point.index())) {
             *of_place = (burnt.burn as f32, is_new(burnt.version));
@@ -42,18 +46,23 @@ pub fn vertex_burns(
     }
     match skin {
         None => of_grid(&of_places, refinement),
-        Some(skin) if skin.is_bound() => skin
-            .bound_places()
-            .zip(0..)
-            .filter_map(|((corners, weights), vertex)| {
-                let corners = corners.map(|place| of_places.get(place as usize).copied().unwrap_or_default());
-                let burn: f32 = corners.iter().zip(weights).map(|((burn, _), weight)| weight * burn).sum();
-                let is_new = corners.iter().any(|(_, is_new)| *is_new);
-                is_new.then_some(VertexBurn { vertex, burn: burn.clamp(0.0, 1.0) })
-            })
-            .collect(),
+        Some(skin) if skin.is_bound() => {
+            let in_triangles =
+                skin.bound_places().map(|(corners, weights)| between(&of_places, &corners, weights.map(f64::from)));
+            let in_cells = skin.cell_places().iter().map(|cell| between(&of_places, &cell.points, cell.weights));
+            // One of both is empty.
+            new_of(in_triangles.chain(in_cells).enumerate().map(|(vertex, (burn, is_new))| (vertex, burn, is_new)))
+        }
         Some(_) => new_of(of_places.into_iter().enumerate().map(|(place, (burn, is_new))| (place, burn, is_new))),
     }
+}
+
+/// Returns the burn between some places, and whether any of them is new.
+fn between<const N: usize>(of_places: &[(f32, bool)], corners: &[u32; N], weights: [f64; N]) -> (f32, bool) {
+    let corners = corners.map(|place| of_places.get(place as usize).copied().unwrap_or_default());
+    let burn: f64 = corners.iter().zip(weights).map(|((burn, _), weight)| weight * f64::from(*burn)).sum();
+    #[allow(clippy::cast_possible_truncation)]
+    (burn.clamp(0.0, 1.0) as f32, corners.iter().any(|(_, is_new)| *is_new))
 }
 
 /// Returns those vertices, with their burns, that are new.
@@ -168,6 +177,36 @@ mod tests {
                 );
             }
         }
+    }
+
+    /// A block of 100 × 100 × 40 mm, of cells of 5 mm.
+    const BLOCK: &str = "[solid]\norgan = { name = \"phantom\", edge_m = 0.008, seed = 1 }\ncell_m = 0.005\n\
+                         fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
+                         [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\ndensity_kg_per_m3 = 980\n\
+                         damping_per_s = 60\n[stepping]\nsubsteps = 8\n";
+
+    #[test]
+    fn vertices_of_a_solid_in_cells_that_have_burnt_through_have_too_and_the_burn_fades_over_a_cell() {
+        let model = Model::parse("block", BLOCK, &[]).unwrap();
+        let (skin, mut tissue) = (Skin::of(&model).unwrap(), at_rest(&model));
+        let top_m = DVec3::new(0.0, 0.0, 0.04);
+        burn(&mut *tissue, top_m, 20);
+        let grid = Refinement::new(&model.scene, 0, &Limits::default()).unwrap();
+        let all = |tissue: &dyn Tissue, since: u32| vertex_burns(&model, &tissue.burns(), Some(&skin), grid, since);
+        let far_m = |vertex: usize| skin.rest_m(skin.vertices()[vertex]).distance(top_m);
+        let most = all(&*tissue, 0).iter().map(|of| of.burn).fold(0.0, f32::max);
+        assert!((most - 0.4).abs() < 1e-6 && tissue.cuts().is_empty(), "{most}");
+        burn(&mut *tissue, top_m, 30);
+        assert!(!tissue.cuts().is_empty());
+        let burns = all(&*tissue, 0);
+        for vertex in 0..skin.vertices().len() {
+            let burn = burn_of(&burns, vertex);
+            // The tip has a radius of 6 mm: cells to 10 mm from its middle lie under it, and it fades to 15 mm.
+            assert!(if far_m(vertex) < 0.005 { burn == 1.0 } else { (0.0..=1.0).contains(&burn) }, "{burn}");
+            assert!(far_m(vertex) < 0.0213 || burn == 0.0, "{burn} {} m away", far_m(vertex));
+        }
+        assert!(burns.iter().filter(|of| far_m(of.vertex as usize) < 0.005).count() > 5);
+        assert!(all(&*tissue, tissue.burns().version()).is_empty());
     }
 
     #[test]

@@ -214,6 +214,11 @@ impl Skin {
         if self.in_cells.is_empty() { 0 } else { self.model.max_cut_vertices().div_ceil(MESH_ROW) }
     }
 
+    /// Returns the cell that the vertex at each place of a frame moves with, its corners by their places in memory; empty but for a solid.
+    pub(super) fn cell_places(&self) -> &[CellPlace] {
+        &self.in_cells
+    }
+
     /// Returns the place in memory of the least corner of the cell that the vertex at each place of a frame moves with; empty but for a
     /// solid.
     pub(super) fn cells(&self) -> impl ExactSizeIterator<Item = u32> + '_ {

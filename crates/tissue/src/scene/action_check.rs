@@ -105,17 +105,13 @@ const MAX_BITE_EDGES: f64 = 8.0;
 /// The longest time of contact that a tip may take to sever, s.
 const MAX_BURN_S: f64 = 3600.0;
 
-/// Checks that a tip that burns is a disc on a sheet or a surface.
-fn check_burning(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
+/// Checks that a tip that burns is no blade: a sheet or a surface takes only discs besides.
+fn check_burning(field: &str, tip: &Tip) -> Result<()> {
     let field = format!("{field}.burn_s");
     let range = format!("from 0 to {MAX_BURN_S}");
     number(&field, tip.burn_s, &range, |burn_s| (0.0..=MAX_BURN_S).contains(&burn_s))?;
-    let refuse = |text: &str| Err(Refusal::new(Reason::WrongKind, field.clone(), text));
-    if tip.burn_s > 0.0 && shape.takes_rigid_tips() {
-        return refuse("is for a sheet or a surface: a solid is not burnt");
-    }
-    if tip.burn_s > 0.0 && tip.shape != TipShape::Disc {
-        return refuse("is for a \"disc\": other tips do not burn");
+    if tip.burn_s > 0.0 && tip.shape == TipShape::Blade {
+        return Err(Refusal::new(Reason::WrongKind, field, "is for a tip that touches: a blade does not burn"));
     }
     Ok(())
 }
@@ -153,7 +149,7 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         }
     }
     check_edge(field, shape, tip)?;
-    check_burning(field, shape, tip)?;
+    check_burning(field, tip)?;
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
         let field = format!("{field}.spring");
         physical(&format!("{field}.stiffness_n_per_m"), stiffness_n_per_m)?;

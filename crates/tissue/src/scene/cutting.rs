@@ -56,7 +56,7 @@ impl Cutting {
         })
     }
 
-    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs, which are those that burn, and `is_tense` whether
+    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs, which are those whose springs burns stiffen, and `is_tense` whether
     /// this one has a pretension.
     pub(super) fn check(&self, has_anchors: bool, is_tense: bool) -> Result<()> {
         self.check_anchors(has_anchors)?;
@@ -98,7 +98,7 @@ impl Cutting {
         let range = format!("from 1 to {MAX_BURNT_STIFFNESS_FACTOR}");
         number(field, factor, &range, |v| (1.0..=MAX_BURNT_STIFFNESS_FACTOR).contains(&v))?;
         let message = if !burns {
-            "is for [sheet] and [mesh]: no tip burns a solid"
+            "is for [sheet] and [mesh]: burns do not stiffen a solid"
         } else if is_tense && factor > 1.0 {
             // Burnt collagen shrinks, so its tension rises by more than its strain at rest says.
             "does not go with springs.pretension_n_per_m: the tension of burnt tissue is not known; leave one of both out"

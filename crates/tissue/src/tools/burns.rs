@@ -1,4 +1,5 @@
-//! What tips have burnt: how long each point has been under one, and which part that is of the time in which it burns through.
+//! What tips have burnt: how long each point has been under one, and which part that is of the time in which it burns through. What burns in
+//! a solid is a cube, which is named by its least corner; each of its corners is as burnt as the most burnt cube around it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,10 +16,10 @@ const LEVELS: f64 = 255.0;
 /// Versions in a snapshot are below this, so that counting on does not overflow.
 const MAX_VERSION: u32 = u32::MAX / 2;
 
-/// A point that has been under a tip that burns and touches.
+/// A point that has been under a tip that burns and touches; in a solid a cube.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct BurntPlace {
-    /// Its place in memory.
+    /// Its place in memory; that of the least corner of a cube.
     place: u32,
     /// For how many steps, 1 or more. Steps have one length, so that the time is exact.
     steps: u32,
@@ -58,7 +59,7 @@ pub struct BurntPoint {
     /// The point.
     pub point: PointId,
     /// Its time of contact divided by that in which it burns through, above 0; 1: it has burnt through. Under several tips the shortest time
-    /// counts.
+    /// counts. In a solid, where cells burn, that of the most burnt cell around the point.
     pub burn: f64,
     /// The version of the burns since which a viewer sees it so: its burn has passed no multiple of 1/255 since.
     pub version: u32,
@@ -82,22 +83,34 @@ impl Burns {
         self.places.is_empty()
     }
 
-    /// Returns the burnt points, each once. `model` is that of the tissue.
-    pub fn points<'b>(&'b self, model: &'b Model) -> impl Iterator<Item = BurntPoint> + 'b {
+    /// Returns the burnt points, each once; in a solid the corners of burnt cells. `model` is that of the tissue.
+    pub fn points(&self, model: &Model) -> impl Iterator<Item = BurntPoint> + use<> {
         let rate_hz = model.scene.stepping.rate_hz;
-        self.places.iter().map(move |burnt| BurntPoint {
-            point: model.point_at(burnt.place as usize),
-            burn: burnt.burn(rate_hz),
-            version: burnt.version,
-        })
+        let mut points: Vec<BurntPoint> = Vec::with_capacity(self.places.len());
+        for burnt in &*self.places {
+            let (burn, version) = (burnt.burn(rate_hz), burnt.version);
+            let mut add = |place: usize| points.push(BurntPoint { point: model.point_at(place), burn, version });
+            match model.places.solid() {
+                Some(places) => places.corners_of(burnt.place as usize).into_iter().for_each(&mut add),
+                None => add(burnt.place as usize),
+            }
+        }
+        if model.places.solid().is_some() {
+            // The most burnt first; of equal ones the one that has been so for longest.
+            points.sort_by(|a, b| {
+                (a.point.index().cmp(&b.point.index())).then(b.burn.total_cmp(&a.burn)).then(a.version.cmp(&b.version))
+            });
+            points.dedup_by_key(|burnt| burnt.point);
+        }
+        points.into_iter()
     }
 
     /// Returns the memory that the burns of a session may take, bytes: its own, those of the guard's checkpoint, of a snapshot, and those
-    /// that others read. 0 for a tissue that is not burnt. `model` is that of the tissue.
+    /// that others read. `model` is that of the tissue.
     pub fn most_bytes(model: &Model) -> u64 {
         const LISTS: u64 = 4;
-        let points = if model.shape().takes_rigid_tips() { 0 } else { model.place_count() };
-        LISTS * points as u64 * size_of::<BurntPlace>() as u64
+        let places = model.places.solid().map_or_else(|| model.place_count(), |places| places.count());
+        LISTS * places as u64 * size_of::<BurntPlace>() as u64
     }
 
     /// Returns the number of steps for which the point at a place in memory has burnt.
@@ -176,7 +189,8 @@ impl Burns {
     /// touches the point.
     pub(crate) fn restored(saved: &[(u32, u32)], times: &[f64], version: u32, model: &Model) -> Result<Self> {
         ensure(saved.is_sorted_by(|a, b| a.0 < b.0), "burnt points out of order")?;
-        let is_sound = |(place, steps): &(u32, u32)| (*place as usize) < model.place_count() && *steps > 0;
+        let is_place = |place: usize| place < model.place_count() && model.is_spring_end(place);
+        let is_sound = |(place, steps): &(u32, u32)| is_place(*place as usize) && *steps > 0;
         ensure(saved.iter().all(is_sound), "a burnt point that is not of the tissue")?;
         ensure(times.is_empty() || times.len() == saved.len(), "burnt points without their times")?;
         ensure(times.iter().all(|through_s| *through_s > 0.0), "a burnt point without a time")?;

@@ -51,6 +51,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::body::disc::SurfaceSample;
 use crate::body::footprint::{Footprint, RestSurface, WeightedNode};
 use crate::body::model::{Model, Plan, displacement_m};
 use crate::body::severed::Cuts;
@@ -61,8 +62,9 @@ use crate::kernel::real::Real;
 use crate::response::tangent::{LinearPatch, Tangent};
 use crate::saved::{Checks, SavedContact, SavedSide, SavedTie, SavedTip, ensure};
 use crate::scene::tie::Tie;
+use crate::shape::PointId;
 use crate::tools::burns::Burns;
-use crate::tools::rigid_tip::RigidTip;
+use crate::tools::rigid_tip::{RigidTip, spacing_m};
 use crate::tools::tie::Ties;
 use palpate_haptics::{ContactState, Coupling, Tip, TipForce, TipShape};
 use palpate_refusal::Result;
@@ -432,6 +434,25 @@ impl Tool {
     pub(crate) fn moved_points(&self) -> impl Iterator<Item = [usize; 2]> {
         let of_disc = self.rigid.is_none().then(|| self.points());
         of_disc.into_iter().flatten().chain(self.rigid.iter().flat_map(RigidTip::points))
+    }
+
+    /// Returns the places in memory of what a tip that touches or holds burns: the points of its disc, in a solid the cubes of the surface
+    /// under it, by their least corners. Some may occur more than once.
+    pub(crate) fn burning_places(&self, model: &Model) -> Vec<usize> {
+        if model.places.solid().is_none() {
+            return self.points().map(|point| model.index_of(point)).collect();
+        }
+        if let Some(rigid) = &self.rigid {
+            return rigid.pressed_cubes(&self.footprint).collect();
+        }
+        // A disc of even pressure presses what lies within its radius, on its own side of a thin part.
+        let (disc, radius_m) = (&self.footprint, self.tip.radius_m);
+        let (anchor_m, outward) = (disc.anchor_m(), disc.at_rest().1);
+        let mut samples = disc.samples(radius_m, spacing_m(radius_m, model.unit_m));
+        samples.retain(|sample| sample.rest_m.distance(anchor_m) <= radius_m && sample.outward.dot(outward) > 0.0);
+        let least = |sample: &SurfaceSample| model.place_of(PointId::new(sample.cell.points[0] as usize));
+        // It may be smaller than the parts of a large triangle.
+        samples.iter().map(least).chain(model.places.solid().map(|places| places.cube_at(anchor_m))).collect()
     }
 
     /// Returns the points of the disc.

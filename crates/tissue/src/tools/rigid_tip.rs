@@ -289,6 +289,13 @@ impl RigidTip {
         self.forces_n.iter().any(|force_n| *force_n != DVec3::ZERO)
     }
 
+    /// Returns the least corners of the cubes in which the samples lie that the tip presses, some of them often. `footprint` is its disc.
+    pub(crate) fn pressed_cubes<'t>(&'t self, footprint: &'t Footprint) -> impl Iterator<Item = usize> + 't {
+        let pressed = self.samples.iter().zip(&self.forces_n).filter(|(_, force_n)| **force_n != DVec3::ZERO);
+        // The corner itself, also where the sample moves with a copy of it.
+        pressed.map(|(sample, _)| footprint.corner_of(self.nodes[sample.nodes[0] as usize].place))
+    }
+
     /// Changes the friction of the tip.
     pub(crate) fn set_friction(&mut self, friction: f64) {
         self.tip.friction = friction;
@@ -747,7 +754,7 @@ fn stored_j(stiffness_n_per_m: f64, force_n: f64, to_core_m: f64) -> f64 {
 }
 
 /// Returns how far samples are apart at most, m.
-fn spacing_m(radius_m: f64, edge_m: f64) -> f64 {
+pub(crate) fn spacing_m(radius_m: f64, edge_m: f64) -> f64 {
     (SPACING * radius_m).min(edge_m)
 }
 

@@ -18,6 +18,10 @@ use crate::shape::{PointId, RestShape};
 /// Name of the tables in messages.
 const TABLES: &str = "the cubes of a solid";
 
+/// By how much more tissue around it a cube counts as deeper than its neighbour, in cubes: more than the rounding of their parts, by which
+/// those of a flat plate differ. Beneath a flat surface it is 9.
+const DEEPER_BY: f64 = 1e-3;
+
 /// One spare place for each of so many corners: a cut through the middle of a block of 27³ cubes doubles a twenty-eighth of them.
 const CORNERS_PER_SPARE: usize = 8;
 
@@ -249,6 +253,43 @@ impl SolidPlaces {
         let other = if is_higher { cube + by } else { (!is_first()).then(|| cube - by)? };
         // Beyond the last cube of a row there is a corner without one.
         (self.weight(cube) > 0.0 && self.weight(other) > 0.0).then_some(other)
+    }
+
+    /// Returns the cube with which a place at rest moves, m, by its least corner: the one in which it lies, or the nearest one.
+    pub(crate) fn cube_at(&self, place_m: DVec3) -> usize {
+        self.shape.corner_of(PointId::new(self.shape.bind(place_m).points[0] as usize))
+    }
+
+    /// Returns the deepest one of the cubes that share a face with a cube: around it is the most tissue, by more than [`DEEPER_BY`] than
+    /// around the cube itself. `None` where no neighbour lies deeper, as in a plate that is as thin as a cube. From cube to cube this leads
+    /// inward, and never in a circle.
+    pub(crate) fn deeper_beside(&self, cube: usize) -> Option<usize> {
+        let mut deepest = None;
+        let mut most = self.tissue_around(cube) + DEEPER_BY;
+        for (axis, is_higher) in (0..3).flat_map(|axis| [(axis, true), (axis, false)]) {
+            let Some(other) = self.cube_across(cube, axis, is_higher) else { continue };
+            let around = self.tissue_around(other);
+            // Of equal ones the first.
+            if around > most {
+                (deepest, most) = (Some(other), around);
+            }
+        }
+        deepest
+    }
+
+    /// Returns how much of a cube and of the 26 around it is inside, in cubes.
+    fn tissue_around(&self, cube: usize) -> f64 {
+        let (lattice, parts, at) = (self.shape.lattice(), self.shape.parts(), self.shape.corner_at(cube));
+        let [x, y, z] = [0, 1, 2].map(|axis| at[axis].saturating_sub(1)..(at[axis] + 2).min(lattice.cells[axis]));
+        let mut sum = 0.0;
+        for k in z {
+            for j in y.clone() {
+                for i in x.clone() {
+                    sum += f64::from(parts[lattice.index([i, j, k])]);
+                }
+            }
+        }
+        sum
     }
 
     /// Returns the places that share a cube with a place, with itself; some twice.

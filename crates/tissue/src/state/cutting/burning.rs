@@ -5,6 +5,12 @@
 //! for as long as the tip that is at one of them takes (`Tip::burn_s`), and springs that resist bending go as in a tear
 //! (`tearing`). The anchor spring of a point that has burnt for so long is severed too, if anchors can be (`anchors`).
 //!
+//! **Solids.** What burns is a cube of the surface, under a rigid tip the one in which a sample that it presses lies. A face is severed once both of
+//! its cubes have burnt through. A surface that is turned in the lattice has burnt cubes above each other: so that no cube comes loose, the
+//! face towards the deepest neighbour of each stays whole ([`SolidPlaces::deeper_beside`]). From any burnt cube such faces lead inward, to one
+//! that no tip burns; a plate that is as thin as a cube burns through. So the depth of a burn is one cube, and what it severs stands across
+//! the surface.
+//!
 //! **Stiffness.** Before that the springs of burnt points become stiffer, if the scene says so (`body::burnt_stiffness`), a level at a time. As with a
 //! severed spring, the past forces that a multistep scheme keeps change as if the spring had always been so stiff. What a stretched spring
 //! then stores more, the heat has given it. Without a tip that burns nothing is computed.
@@ -12,11 +18,23 @@
 use std::collections::BTreeMap;
 
 use super::{Crossing, SpringStretch};
+use crate::body::model::Model;
+use crate::body::solid::SolidPlaces;
+use crate::body::spring_ends::SpringEnd;
 use crate::body::tables::StiffenedSpring;
 use crate::kernel::real::Real;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::Contacts;
 use palpate_haptics::ContactState;
+
+impl Model {
+    /// Returns whether a face between the cubes of a solid is that to the deepest neighbour of one of both ([`SolidPlaces::deeper_beside`]).
+    fn leads_deeper(&self, place: usize, face: &SpringEnd) -> bool {
+        let leads = |places: &SolidPlaces, [from, to]: [usize; 2]| places.deeper_beside(from) == Some(to);
+        let ends = [place, face.other];
+        self.places.solid().is_some_and(|places| leads(places, ends) || leads(places, [ends[1], ends[0]]))
+    }
+}
 
 impl<T: Real> TissueState<T> {
     /// Burns what lies under tips that burn for a step. Returns the whole springs that this severs; some perhaps twice.
@@ -24,9 +42,8 @@ impl<T: Real> TissueState<T> {
         let TissueState { model, contacts, .. } = self;
         let burning = contacts.tools.iter().filter(|tool| tool.tip.burn_s > 0.0);
         let touching = burning.filter(|tool| tool.contact_state != ContactState::Free);
-        let under: Vec<(f64, Vec<usize>)> = touching
-            .map(|tool| (tool.tip.burn_s, tool.points().map(|point| model.index_of(point)).collect()))
-            .collect();
+        let under: Vec<(f64, Vec<usize>)> =
+            touching.map(|tool| (tool.tip.burn_s, tool.burning_places(model))).collect();
         if under.is_empty() {
             return Vec::new();
         }
@@ -48,7 +65,8 @@ impl<T: Real> TissueState<T> {
                 through.push(place);
                 let first_end = model.first_end(place);
                 model.each_spring(place, |spring| {
-                    if is_through(spring.other) && !tables.severed.has(first_end + spring.number) {
+                    let is_severed = || tables.severed.has(first_end + spring.number);
+                    if is_through(spring.other) && !is_severed() && !model.leads_deeper(place, &spring) {
                         found.push(Crossing::in_middle(model, place, spring));
                     }
                 });

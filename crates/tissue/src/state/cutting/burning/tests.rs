@@ -20,13 +20,23 @@ fn burning(radius_m: f64) -> Tip {
     Tip { radius_m, burn_s: 1e-3 * f64::from(BURN_STEPS), ..Tip::default() }
 }
 
-/// A gallbladder, or a sheet of 150 × 130 mm on a soft ground, which settles within some steps.
+/// A gallbladder, a block of 100 × 100 × 40 mm on a table, of cubes of 5 mm, or a sheet of 150 × 130 mm on a soft ground, which settles within
+/// some steps.
 fn model(kind: &str, sets: &[&str]) -> Arc<Model> {
-    if kind == "surface" {
-        return Model::gallbladder(sets);
+    match kind {
+        "surface" => Model::gallbladder(sets),
+        "solid" => Model::parse("block", BLOCK, sets).unwrap(),
+        _ => Model::parse("sheet", SHEET, sets).unwrap(),
     }
-    Model::parse("sheet", SHEET, sets).unwrap()
 }
+
+/// The kinds of tissue.
+const KINDS: [&str; 3] = ["sheet", "surface", "solid"];
+
+const BLOCK: &str = "[solid]\norgan = { name = \"phantom\", edge_m = 0.008, seed = 1 }\ncell_m = 0.005\n\
+                     fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
+                     [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\ndensity_kg_per_m3 = 980\n\
+                     damping_per_s = 60\n[stepping]\nsubsteps = 8\n";
 
 const SHEET: &str = "[sheet]\npoints = [31, 27]\nspacing_m = 0.005\npoint_mass_kg = 1e-4\n\
                      [springs]\nstiffness_n_per_m = 100\nbending = true\n[anchor_springs]\nstiffness_n_per_m = 5\n\
@@ -64,7 +74,7 @@ fn touch(tissue: &mut dyn Tissue, tip: Tip, steps: u32) {
 
 #[test]
 fn a_tip_severs_what_lies_under_it_at_the_stated_time_of_contact_to_a_step() {
-    for kind in ["sheet", "surface"] {
+    for kind in KINDS {
         for grasps in [false, true] {
             let model = model(kind, &["stepping.precision=f64"]);
             let mut tissue = at_rest(&model);
@@ -97,7 +107,7 @@ fn a_tip_severs_what_lies_under_it_at_the_stated_time_of_contact_to_a_step() {
 
 #[test]
 fn a_tip_that_leaves_in_time_severs_nothing_and_times_of_contact_add_up() {
-    for kind in ["sheet", "surface"] {
+    for kind in KINDS {
         let model = model(kind, &["stepping.precision=f64"]);
         let mut tissue = at_rest(&model);
         let tip = burning(0.006);
@@ -155,7 +165,7 @@ fn near(model: &Model, point: PointId, x: f64) -> bool {
 
 #[test]
 fn a_burn_has_the_same_bits_at_every_width_and_continues_from_a_snapshot() {
-    for kind in ["sheet", "surface"] {
+    for kind in KINDS {
         for precision in ["f32", "f64"] {
             let mut hashes = Vec::new();
             for lanes in ["plain", "auto"] {
@@ -208,7 +218,7 @@ fn what_is_burnt_is_kept_by_the_state_that_the_guard_goes_back_to_and_by_a_recov
 
 #[test]
 fn the_burn_of_a_point_is_its_time_of_contact_as_a_part_of_that_of_the_quickest_tip() {
-    for kind in ["sheet", "surface"] {
+    for kind in KINDS {
         let model = model(kind, &["stepping.precision=f64"]);
         let mut tissue = at_rest(&model);
         let most = |tissue: &dyn Tissue| tissue.burns().points(&model).map(|burnt| burnt.burn).fold(0.0, f64::max);
@@ -294,7 +304,7 @@ fn a_restored_tissue_has_the_burns_in_their_version_and_those_of_an_earlier_form
 
 #[test]
 fn a_tissue_moves_alike_under_a_tip_that_burns_until_that_severs_and_only_a_burn_is_state() {
-    for kind in ["sheet", "surface"] {
+    for kind in KINDS {
         let model = model(kind, &["stepping.precision=f32"]);
         let done = |depth_m: f64, burn_s: f64| {
             let mut tissue = at_rest(&model);
@@ -319,12 +329,18 @@ fn tips_that_cannot_burn_are_refused() {
     }
     let blade = Tip { shape: TipShape::Blade, edge_m: 0.02 * DVec3::Z, burn_s: 0.5, ..Tip::default() };
     assert_eq!((&*refused(blade).field, refused(blade).reason), ("tip.burn_s", Reason::WrongKind));
-    let block = "[solid]\norgan = { name = \"phantom\", edge_m = 0.008, seed = 1 }\ncell_m = 0.01\n\
-                 fixed = [{ plane_m = [0, 0, 0], normal = [0, 0, 1], within_m = 0.001 }]\n\
-                 [material]\nyoungs_modulus_pa = 15e3\npoissons_ratio = 0.45\ndensity_kg_per_m3 = 980\n";
-    let solid = Model::parse("block", block, &[]).unwrap();
-    let refusal = check_tip("tip", solid.shape(), &burning(0.005)).unwrap_err();
-    assert_eq!((&*refusal.field, refusal.reason), ("tip.burn_s", Reason::WrongKind));
+    let sphere = Tip { shape: TipShape::Sphere, ..burning(0.005) };
+    assert_eq!(&*refused(sphere).field, "tip.shape");
+    // On a solid other tips touch, and burn.
+    let (solid, edge_m) = (model("solid", &[]), 0.02 * DVec3::Z);
+    for shape in [TipShape::Disc, TipShape::RigidDisc, TipShape::Sphere, TipShape::Blade] {
+        let tip = Tip { shape, ..burning(0.005) };
+        let tip = if shape == TipShape::Blade { Tip { edge_m, ..tip } } else { tip };
+        let refusal = check_tip("tip", solid.shape(), &tip).err().map(|refusal| (refusal.field, refusal.reason));
+        let expected = (shape == TipShape::Blade).then(|| ("tip.burn_s".into(), Reason::WrongKind));
+        assert_eq!(refusal, expected, "{shape:?}");
+    }
 }
 
+mod solid;
 mod stiffness;
