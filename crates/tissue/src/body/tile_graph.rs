@@ -130,14 +130,14 @@ impl TileGraph {
 
     /// Returns the watched tiles whose neighbours have moved by more than `far`: points next to a tile since it fell
     /// asleep (`snapshots`), and on a sheet also points whose motion reaches it in the `sweeps` of a substep, in the
-    /// substep before.
+    /// substep before. On a mesh only points in the tiles `of` are looked at.
     pub(crate) fn woken<T: Real>(
         &self,
         watches: &Watches,
         [u, d]: [&Field<T>; 2],
-        snapshots: &[T],
+        (snapshots, far): (&[T], T),
         sweeps: usize,
-        far: T,
+        of: impl Fn(usize) -> bool,
     ) -> Vec<usize> {
         match self {
             TileGraph::Sheet(sheet) => {
@@ -146,7 +146,8 @@ impl TileGraph {
             }
             TileGraph::Linked(places, layout) => {
                 let moved = |tile: &&usize| {
-                    places.links().is_some_and(|links| links.has_moved(layout, **tile, u, snapshots, far))
+                    let compared = (u, snapshots, far);
+                    places.links().is_some_and(|links| links.has_moved(layout, **tile, &of, compared))
                 };
                 watches.tiles.iter().filter(moved).copied().collect()
             }

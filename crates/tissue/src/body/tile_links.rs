@@ -13,6 +13,9 @@ pub(crate) struct TileLinks {
     /// of the last.
     around: Vec<[u32; 2]>,
     firsts_around: Vec<usize>,
+    /// The successive ones of these that are in one tile: that tile, and how many there are. Where each tile's runs begin, in the same way.
+    runs: Vec<[u32; 2]>,
+    firsts_runs: Vec<usize>,
     /// The tiles of these places, ascending, in the same way.
     beside: Vec<u32>,
     firsts_beside: Vec<usize>,
@@ -24,14 +27,19 @@ impl TileLinks {
     pub(crate) fn of(size @ [rows, columns]: [usize; 2], joined: impl Fn(usize) -> Vec<usize>) -> Self {
         let across = tiles(columns);
         let tile_of = |place: usize| place / columns / TILE * across + place % columns / TILE;
-        let mut links = TileLinks { firsts_around: vec![0], firsts_beside: vec![0], ..TileLinks::default() };
+        let mut links =
+            TileLinks { firsts_around: vec![0], firsts_runs: vec![0], firsts_beside: vec![0], ..TileLinks::default() };
         for tile in 0..tiles(rows) * across {
             let places = places_of(size, tile);
             let mut beyond: Vec<u32> =
                 places.flat_map(&joined).filter(|place| tile_of(*place) != tile).map(|place| place as u32).collect();
             beyond.sort_unstable();
             beyond.dedup();
-            let mut beside: Vec<u32> = beyond.iter().map(|place| tile_of(*place as usize) as u32).collect();
+            let tile_of = |place: &u32| tile_of(*place as usize) as u32;
+            let runs = beyond.chunk_by(|one, next| tile_of(one) == tile_of(next));
+            links.runs.extend(runs.map(|run| [tile_of(&run[0]), run.len() as u32]));
+            links.firsts_runs.push(links.runs.len());
+            let mut beside: Vec<u32> = beyond.iter().map(tile_of).collect();
             beside.sort_unstable();
             beside.dedup();
             links.around.extend(beyond.iter().map(|place| [place / columns as u32, place % columns as u32]));
@@ -70,23 +78,35 @@ impl TileLinks {
         }
     }
 
-    /// Returns whether a point around a tile is more than `far` from where the tile remembers it.
+    /// Returns whether a point around a tile, in one of the tiles `of`, is more than `far` from where the tile remembers it.
     pub(crate) fn has_moved<T: Real>(
         &self,
         layout: &Layout,
         tile: usize,
-        u: &Field<T>,
-        snapshots: &[T],
-        far: T,
+        of: impl Fn(usize) -> bool,
+        (u, snapshots, far): (&Field<T>, &[T], T),
     ) -> bool {
         let (places, first) = self.around(tile);
-        (0..3).any(|c| {
-            let then = &snapshots[3 * first + c * places.len()..][..places.len()];
-            let plane = &u[c * layout.plane..][..layout.plane];
-            let any =
-                |any: bool, (place, then): (_, &T)| any | ((plane[offset(layout, place)] - *then).magnitude() > far);
-            places.iter().zip(then).fold(false, any)
-        })
+        let mut from = 0;
+        for [other, count] in &self.runs[self.firsts_runs[tile]..self.firsts_runs[tile + 1]] {
+            let run = from..from + *count as usize;
+            from = run.end;
+            if !of(*other as usize) {
+                continue;
+            }
+            let moved = (0..3).any(|c| {
+                let then = &snapshots[3 * first + c * places.len()..][run.clone()];
+                let plane = &u[c * layout.plane..][..layout.plane];
+                let any = |any: bool, (place, then): (_, &T)| {
+                    any | ((plane[offset(layout, place)] - *then).magnitude() > far)
+                };
+                places[run.clone()].iter().zip(then).fold(false, any)
+            });
+            if moved {
+                return true;
+            }
+        }
+        false
     }
 }
 

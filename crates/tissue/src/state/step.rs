@@ -63,6 +63,10 @@ impl<T: Real> TissueState<T> {
             self.tiles.wake_all();
         }
         self.tiles.wake_beside_moved([&self.state.u, &self.state.d], self.plan.scheme.sweeps(), far);
+        if !self.prescribed.is_empty() {
+            // A grasp may move its point by less than that in a sleeping tile.
+            self.tiles.compare_all();
+        }
         let (mut context, prescribed, _) = self.parts();
         wake_moved(&mut context, prescribed, from.step, end, far);
         self.ended(StepStage::Sleep);

@@ -125,6 +125,8 @@ pub(crate) struct SleepTiles<T> {
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
     watches: Watches,
+    /// The movement for which all points around the watched tiles were compared, since the same tiles have been awake; `None` before that.
+    compared: Option<f64>,
     /// Tiles that were awake since the last checkpoint.
     touched: Marks,
     /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved:
@@ -162,6 +164,7 @@ impl<T: Real> SleepTiles<T> {
             volume_change: Vec::new(),
             snapshots: Vec::new(),
             watches: Watches::default(),
+            compared: None,
             touched: Marks::none_of(count),
             moved: Marks::none_of(count),
             largest: 0.0,
@@ -183,6 +186,7 @@ impl<T: Real> SleepTiles<T> {
             volume_change: Vec::new(),
             snapshots: Vec::new(),
             watches: Watches::default(),
+            compared: None,
             touched: Marks::default(),
             moved: self.moved.clone(),
             graph: self.graph.clone(),
@@ -326,6 +330,7 @@ impl<T: Real> SleepTiles<T> {
             self.touched.add(*tile);
         }
         self.graph.watch(&self.region.awake, &mut self.watches);
+        self.compared = None;
         // The last tile of a mesh has empty places.
         self.awake_points = self.awake_points.min(self.points);
     }
@@ -392,8 +397,20 @@ impl<T: Real> SleepTiles<T> {
             return;
         }
         self.remember();
-        let waking = self.graph.woken(&self.watches, moved, &self.snapshots, sweeps, T::of(far));
+        // What sleeps has stayed where it was.
+        let awake_alone = self.compared.is_some_and(|compared| far >= compared);
+        if !awake_alone {
+            self.compared = Some(far);
+        }
+        let awake = &self.region.awake.has;
+        let of = |tile: usize| !awake_alone || awake[tile];
+        let waking = self.graph.woken(&self.watches, moved, (&self.snapshots, T::of(far)), sweeps, of);
         self.wake(waking);
+    }
+
+    /// Makes the next comparison of tiles with points around them one of all points: also of those that sleep.
+    pub(crate) fn compare_all(&mut self) {
+        self.compared = None;
     }
 
     /// Wakes tiles on which the pressure has changed too much since they fell asleep: `stiffness` times the
