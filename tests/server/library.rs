@@ -167,6 +167,33 @@ async fn a_tool_that_somebody_holds_ends_the_bridge_with_its_number_and_holder()
     assert!(error.contains("tool 0 is held by `") && error.contains("TOOL_HELD"), "{error}");
 }
 
+/// Who ends a loop may use its tool at once by a call: neither a loop that ends by its time nor one that is told to end leaves it held.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_tool_is_free_once_its_loop_has_ended() {
+    let server = TestServer::start(&[]);
+    let session_id = create(at(&server).connect().await.unwrap(), "paper").await;
+    // A lease ends with its connection.
+    let mut haptics = server.haptics().await;
+    for round in 0..20 {
+        let (device, _felt) = pressing();
+        let lasts = Duration::from_millis(50);
+        let options = Options { lasts: (round % 2 == 0).then_some(lasts), ..Options::default() };
+        let target = target(&server, SessionChoice::Existing(session_id.clone()));
+        let stop =
+            async move { if round % 2 == 0 { std::future::pending().await } else { tokio::time::sleep(lasts).await } };
+        let serving = run(device, target, options, stop);
+        let ended = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it does not end");
+        // A loop that was told to end before it was connected has held nothing.
+        if let Err(error) = ended {
+            assert!(round % 2 == 1, "{error}");
+        }
+        let request = pb::AcquireToolRequest { session_id: session_id.clone(), tool: 0, ..Default::default() };
+        let lease_id = haptics.acquire_tool(request).await.unwrap().into_inner().lease_id;
+        let request = pb::ReleaseToolRequest { session_id: session_id.clone(), lease_id };
+        haptics.release_tool(request).await.unwrap();
+    }
+}
+
 #[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bridge_that_touched_nothing_says_so_and_tells_the_session_that_it_keeps() {

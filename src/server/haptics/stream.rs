@@ -312,7 +312,11 @@ async fn listen(
                 let refusal = Refusal::new(Reason::OutOfTurn, "message", "must be a command or `renew`");
                 return events.close(refusal);
             }
-            Ok(None) => return events.push(StreamEvent::Finished),
+            Ok(None) => {
+                // Who hears of the end may take the tools at once.
+                drop(held);
+                return events.push(StreamEvent::Finished);
+            }
             Err(status) => {
                 debug!(session = %handle.id, %status, "a client disappeared or sent an unreadable message");
                 return events.push(StreamEvent::Failed(status));

@@ -1,6 +1,7 @@
 //! The network side of a bridge: connects, opens a haptic stream, and transfers commands and models. When the
 //! connection breaks, it connects again; in a fleet, to the server that has the session then.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -86,14 +87,19 @@ impl Shared {
 /// The commands of a loop, for the network side.
 pub(super) struct Commands {
     pub(super) queue: QueueReader<ToolPose>,
-    /// Notified when the queue has a command, or the loop has ended.
+    /// Notified when the queue has a command, or the loop has ended or is to end.
     pub(super) news: Arc<Notify>,
+    /// Whether the loop is to end: then no more commands are sent.
+    pub(super) is_stopped: Arc<AtomicBool>,
 }
 
 impl Commands {
     /// Returns the next command; `None` after the last. Dropping the future loses none.
     async fn recv(&mut self) -> Option<ToolPose> {
         loop {
+            if self.is_stopped.load(Ordering::Relaxed) {
+                return None;
+            }
             let is_over = self.queue.is_over();
             if let Some(command) = self.queue.pop() {
                 return Some(command);
@@ -113,7 +119,7 @@ const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2
 const MAX_MOVES: u32 = 8;
 
 /// Time without a message from the server after which the connection is given up.
-const SILENCE: Duration = Duration::from_secs(2);
+pub(super) const SILENCE: Duration = Duration::from_secs(2);
 
 /// Time limit for opening a stream. The server computes the first force law in that time, which takes seconds on a
 /// busy machine; a client that gives up earlier makes it start again each time.
@@ -467,7 +473,12 @@ async fn connect(
                 }
             }
             command = commands.recv() => {
-                let Some(ToolPose { client_time_ns, pose, velocity_m_per_s, orientation, buttons }) = command else { return Ok(()) };
+                let Some(ToolPose { client_time_ns, pose, velocity_m_per_s, orientation, buttons }) = command else {
+                    drop(outbound);
+                    // The server ends its part once it has released the tool.
+                    end_of(&mut stream).await;
+                    return Ok(());
+                };
                 let led = cutting.as_mut().map(|cutting| cutting.next(pose.place_m, orientation, buttons));
                 let (tip, is_released) = led.unwrap_or((target.tip, false));
                 if is_released {

@@ -34,7 +34,7 @@ use crate::Error;
 use crate::connect::Server;
 use crate::device::HapticDevice;
 use crate::os::{self, Priority};
-use line::{Commands, Shared};
+use line::{Commands, SILENCE, Shared};
 
 pub use cut_button::CutButton;
 pub use hand_slot::{HandSlot, two_hand_slots};
@@ -289,6 +289,8 @@ pub async fn run_told<D: HapticDevice + 'static>(
     let (device, served, priority) =
         ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
     let made = line.shared.inbound().made.clone();
+    // The loop is over: the network side ends the stream, and the server releases the tool.
+    let _ = tokio::time::timeout(SILENCE, line.network.join_next()).await;
     line.close().await;
     let tick::Served {
         course,
@@ -384,18 +386,24 @@ fn line(
     let Led { hand, instrument, cut_button } = led;
     let ticker = ticker.of_hand(hand, target.tool, target.tip).of_instrument(instrument.clone());
     let (shared, news) = (Arc::new(Shared::default()), Arc::new(Notify::new()));
-    let commands = Commands { queue, news: news.clone() };
+    let is_stopped = Arc::new(AtomicBool::new(false));
+    let commands = Commands { queue, news: news.clone(), is_stopped: is_stopped.clone() };
     let mut network = JoinSet::new();
     network.spawn({
-        let shared = shared.clone();
+        let (shared, news) = (shared.clone(), news.clone());
         async move {
             // The text may contain parts that a server has written.
             let warn = |message: &str| warn.iter().for_each(|warn| warn(&printable(message)));
+            let kept = line::keep(target, instrument, cut_button, copies, device, &shared, feed, commands, &warn);
+            tokio::pin!(kept);
             tokio::select! {
-                () = line::keep(target, instrument, cut_button, copies, device, &shared, feed, commands, &warn) => {}
-                // The loop then detects that it is over.
+                () = &mut kept => return,
                 () = stop => {}
             }
+            is_stopped.store(true, Ordering::Relaxed);
+            news.notify_one();
+            // Until the server has released the tool. The loop then detects that it is over.
+            let _ = tokio::time::timeout(SILENCE, kept).await;
         }
     });
     (ticker, Connection { network, shared, news, server, keeps_session })
