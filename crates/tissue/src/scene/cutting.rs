@@ -56,8 +56,8 @@ impl Cutting {
         })
     }
 
-    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs, which are those whose springs burns stiffen, and `is_tense` whether
-    /// this one has a pretension.
+    /// Checks the values; `has_anchors` tells whether tissues of this kind have anchor springs (only these does a burn stiffen), and `is_tense`
+    /// whether this one has a pretension.
     pub(super) fn check(&self, has_anchors: bool, is_tense: bool) -> Result<()> {
         self.check_anchors(has_anchors)?;
         self.check_burns(has_anchors, is_tense)?;
