@@ -9,8 +9,11 @@ const MAX_LETTERS = 600;
  */
 const ACTS = /[\p{Cc}\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb\u{e0000}-\u{e007f}]/gu;
 
-/** Prepares a text from a server for display: each such character is replaced by `?`, and long texts are cut. */
+/** Line breaks and tabs, which are spaces on the page. */
+const BREAKS = /\s*[\n\r\t]\s*/g;
+
+/** Prepares a text from a server for display: line breaks become spaces, each such character is replaced by `?`, and long texts are cut. */
 export function excerpt(text: string): string {
   const begin = text.length > MAX_LETTERS ? `${text.slice(0, MAX_LETTERS)} …` : text;
-  return begin.replace(ACTS, "?");
+  return begin.replace(BREAKS, " ").replace(ACTS, "?");
 }

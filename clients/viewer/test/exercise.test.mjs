@@ -34,6 +34,7 @@ describe("an exercise", () => {
     await page.picture("exercise-briefing");
     // Time does not pass while it is read.
     assert.equal(await page.text("exercise-time"), "0:00 of 2:00");
+    assert.match(await page.text("briefing-instructions"), /mark each place where you feel/, "a line break is a space");
     assert.equal(await page.page.locator("#lumps-shown").isVisible(), false);
     await page.page.click("#begin-exercise");
     await page.until(({ exercise }) => !exercise.isBriefing);

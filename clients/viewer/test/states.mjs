@@ -33,7 +33,8 @@ async function shown(context, path) {
 
 /** Presses for a while. @param {Page} page @param {string} tool */
 async function pressed(page, tool, x = 0.42, y = 0.5) {
-  await page.page.check(`input[value=${tool}]`, { force: true });
+  // Without scrolling there: on a phone the tissue would go out of sight, and figures that come meanwhile move the tools.
+  await page.page.locator(`input[value=${tool}]`).evaluate((radio) => /** @type {HTMLInputElement} */ (radio).click());
   await page.press(x, y);
   await page.until(({ forceN }) => forceN[0] > 1e-3);
   await page.page.waitForTimeout(2500);
