@@ -61,9 +61,11 @@ const STATES = {
   briefing: async (context) => ({ page: await shown(context, "?exercise=lumps-2") }),
   exercise: async (context) => ({ page: await begun(context) }),
   debriefing: async (context) => {
-    const page = await begun(context);
+    const page = await shown(context, "?exercise=lumps-2");
+    await page.page.click("#begin-exercise");
+    await page.page.waitForTimeout(1500);
     await page.page.click("#mark-here");
-    await page.page.mouse.click(...(await page.at(0.42, 0.5)));
+    await page.page.mouse.click(...(await page.at(0.45, 0.55)));
     await page.until(({ exercise }) => exercise.answers === 1);
     await page.page.click("#finish-exercise");
     await page.until(({ exercise }) => exercise.isDebriefing);
