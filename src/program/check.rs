@@ -96,6 +96,7 @@ fn exercise_row(chosen: &ChosenExercise) -> String {
 /// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
+    arguments.exercise.warn_of_name(chosen.as_ref());
     let (model, limits) = exercise::compile(chosen.as_ref(), &arguments.scene)?;
     let chosen = exercise::with_noticed_pressure(chosen, &model, &limits)?;
     if let Some(chosen) = &chosen {

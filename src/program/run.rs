@@ -64,6 +64,7 @@ pub(crate) struct RunArguments {
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let chosen = arguments.exercise.chosen()?;
+    arguments.exercise.warn_of_name(chosen.as_ref());
     let (model, limits) = compile(chosen.as_ref(), &arguments.scene)?;
     let chosen = with_noticed_pressure(chosen, &model, &limits)?;
     let options = arguments.score_options.checked(usual_thresholds(chosen.as_ref()))?;

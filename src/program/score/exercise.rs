@@ -45,15 +45,19 @@ impl ExerciseOptions {
     pub(crate) fn chosen(&self) -> Result<Option<ChosenExercise>, Refusal> {
         let Some(path) = &self.exercise else { return Ok(None) };
         let (name, text) = find_exercise(path, &Limits::default())?;
-        let chosen = ChosenExercise::new(&name, &text, self.seed).map_err(of_option)?;
-        let (named, file) = (&chosen.exercise.name, path.file_stem().unwrap_or_default());
-        if file != named.as_str() {
+        ChosenExercise::new(&name, &text, self.seed).map(Some).map_err(of_option)
+    }
+
+    /// Warns if the file of the exercise is not named as the exercise is.
+    pub(crate) fn warn_of_name(&self, chosen: Option<&ChosenExercise>) {
+        let (Some(path), Some(ChosenExercise { exercise, .. })) = (&self.exercise, chosen) else { return };
+        if path.file_stem().unwrap_or_default() != exercise.name.as_str() {
             say!(
-                "palpate: warning: exercise {named}: its file is {}: a server leaves out an exercise whose file is named otherwise",
+                "palpate: warning: exercise {}: its file is {}: a server leaves out an exercise whose file is named otherwise",
+                exercise.name,
                 path.display()
             );
         }
-        Ok(Some(chosen))
     }
 
     /// Returns the exercise of a recorded session: that of its journal, if the session was made for one, or else the one that was given.
